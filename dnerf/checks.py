@@ -1,0 +1,64 @@
+"""Checks of arguments at public doors: one line that names the argument, what was expected and what came."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def check_shape(name: str, value: Tensor, shape: Sequence[int | str]) -> None:
+    """Raise unless `value` has the given shape; a string in `shape` stands for any size and is printed as is.
+
+    Raises:
+        ValueError: naming the argument, the expected and the actual shape.
+    """
+    fits = value.dim() == len(shape) and all(
+        isinstance(want, str) or want == got for want, got in zip(shape, value.shape)
+    )
+    if not fits:
+        expected = "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
+        raise ValueError(f"{name} must have shape {expected}, got {tuple(value.shape)}")
+
+
+def check_batch(name: str, value: Tensor, positions: Tensor) -> None:
+    """Raise unless `value` has the batch shape of `positions` (..., 3), as times must.
+
+    Raises:
+        ValueError: naming the argument, the expected and the actual shape.
+    """
+    if value.shape != positions.shape[:-1]:
+        raise ValueError(f"{name} must have shape {tuple(positions.shape[:-1])}, got {tuple(value.shape)}")
+
+
+def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:
+    """Raise unless a number is positive (or zero where allowed) and finite.
+
+    Raises:
+        ValueError: naming the argument and its value.
+    """
+    if not (value > 0 or (allow_zero and value == 0)) or value == float("inf"):
+        bound = ">= 0" if allow_zero else "> 0"
+        raise ValueError(f"{name} must be {bound} and finite, got {value}")
+
+
+def check_choice(name: str, value: object, choices: Sequence[object]) -> None:
+    """Raise unless `value` is one of `choices`.
+
+    Raises:
+        ValueError: naming the argument, the choices and the value.
+    """
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(str, choices))}; got {value!r}")
+
+
+def as_box(box: Sequence[Sequence[float]] | Tensor) -> Tensor:
+    """Return an axis-aligned box as a (2, 3) float32 tensor of its lowest and highest corner.
+
+    Raises:
+        ValueError: if the shape is wrong or the box is empty or not finite.
+    """
+    corners = torch.as_tensor(box, dtype=torch.float32)
+    check_shape("box", corners, (2, 3))
+    if not bool(torch.isfinite(corners).all()) or not bool((corners[1] > corners[0]).all()):
+        raise ValueError(f"box must have finite corners, low < high on every axis, got {corners.tolist()}")
+    return corners

@@ -1,0 +1,164 @@
+"""The shared alpha-compositing renderer: everything that emits light along a ray goes through `composite`.
+
+With interval lengths d_i, densities s_i and optical depths tau_i = s_i d_i (Max 1995, eq. 26; NeRF eq. 3):
+
+    w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i)),    C = sum_i w_i c_i + (1 - sum_i w_i) background
+
+The exclusive sum is a shifted one (never "inclusive minus self", which is inf - inf on opaque intervals), the
+opacity of an interval is `-expm1(-tau)` (exact for thin ones), and sums run per ray in at least float32.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from dnerf.checks import check_shape
+from dnerf.kernels import packed_sum, packed_weights
+from dnerf.rays import Samples
+
+
+@dataclass(frozen=True)
+class FieldOutput:
+    """What a radiance field says at some points.
+
+    Args:
+        density: (...,) >= 0 in 1 / world unit.
+        rgb: (..., 3) in [0, 1].
+        extras: further per-point tensors that losses read, for example "canonical_positions" (..., 3).
+    """
+
+    density: Tensor
+    rgb: Tensor
+    extras: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What R rays (or the pixels of an image: (H, W) instead of (R,)) show.
+
+    Args:
+        rgb: (R, 3) light reaching the eye, background included.
+        opacity: (R,) in [0, 1], light absorbed along the ray.
+        depth: (R,) expected distance at which the absorbed light is absorbed, in world units; 0 where opacity is 0.
+        background: (R, 3) what lies behind, or None for black.
+        weights: share of each sample in the picture, laid out like the samples; None for whole images.
+        samples: the samples composited; None for whole images.
+        output: what the field said there; None for whole images.
+        proposals: renderings of the sampler's earlier passes (the coarse network's picture).
+    """
+
+    rgb: Tensor
+    opacity: Tensor
+    depth: Tensor
+    background: Tensor | None = None
+    weights: Tensor | None = None
+    samples: Samples | None = None
+    output: FieldOutput | None = None
+    proposals: "tuple[Rendering, ...]" = ()
+
+
+def _at_least_float32(values: Tensor) -> Tensor:
+    return values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
+
+
+def render_weights(optical_depth: Tensor, samples: Samples) -> Tensor:
+    """Weight of each sample in the picture: the transmittance before it times its own opacity.
+
+    Args:
+        optical_depth: (R, S) or (N,), density times interval length, >= 0, infinity allowed.
+        samples: the samples it belongs to, dense or packed.
+
+    Returns:
+        Weights laid out like the input, each ray's sum at most 1; float32 for half-precision input.
+
+    Raises:
+        ValueError: if the layout is not that of the samples.
+    """
+    check_shape("optical_depth", optical_depth, samples.starts.shape)
+    depth = _at_least_float32(optical_depth)
+    if samples.is_packed:
+        return packed_weights(depth, samples.offsets)
+    before = torch.cumsum(depth[:, :-1], dim=-1)
+    transmittance = torch.exp(-torch.cat([torch.zeros_like(depth[:, :1]), before], dim=-1))
+    return transmittance * -torch.expm1(-depth)
+
+
+def sum_along_rays(values: Tensor, samples: Samples, weights: Tensor | None = None) -> Tensor:
+    """Sum each ray's samples, weighted if weights are given.
+
+    Args:
+        values: (R, S, ...) or (N, ...); float32 sums for half-precision input.
+        samples: the samples they belong to.
+        weights: (R, S) or (N,), optional.
+
+    Returns:
+        (R, ...); zero for rays without samples.
+
+    Raises:
+        ValueError: if the leading axes are not those of the samples.
+    """
+    leading = values.shape[: samples.starts.dim()]
+    if leading != samples.starts.shape:
+        expected = ", ".join(str(size) for size in (*samples.starts.shape, "..."))
+        raise ValueError(f"values must have shape ({expected}), got {tuple(values.shape)}")
+    values = _at_least_float32(values)
+    if weights is not None:
+        check_shape("weights", weights, samples.starts.shape)
+    if samples.is_packed:
+        flat = values if values.dim() == 1 else values.flatten(1)
+        summed = packed_sum(flat, weights, samples.offsets)
+        return summed if values.dim() == 1 else summed.unflatten(1, values.shape[1:])
+    if weights is not None:
+        values = values * weights.reshape(*weights.shape, *[1] * (values.dim() - weights.dim()))
+    return values.sum(dim=1)
+
+
+def safe_divide(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """Quotient that is 0, with zero gradient, where the denominator is 0."""
+    zero = denominator == 0
+    return torch.where(zero, torch.zeros_like(numerator), numerator / torch.where(zero, 1.0, denominator))
+
+
+def composite(samples: Samples, output: FieldOutput, background: Tensor | None = None) -> Rendering:
+    """Composite a field's output along rays into colour, opacity and expected depth.
+
+    Args:
+        samples: dense or packed intervals of R rays.
+        output: the field at the samples' points, laid out like them.
+        background: (R, 3) or (3,) colour behind the rays; None is black.
+
+    Returns:
+        A `Rendering`; rays without samples show the background.
+
+    Raises:
+        ValueError: if shapes do not fit.
+    """
+    check_shape("density", output.density, samples.starts.shape)
+    check_shape("rgb", output.rgb, (*samples.starts.shape, 3))
+    weights = render_weights(_at_least_float32(output.density) * samples.lengths, samples)
+    columns = torch.cat(
+        [
+            _at_least_float32(output.rgb).to(weights.dtype),
+            samples.distances[..., None].to(weights.dtype),
+            torch.ones_like(weights)[..., None],
+        ],
+        dim=-1,
+    )
+    sums = sum_along_rays(columns, samples, weights)
+    rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
+    if background is not None:
+        if background.shape != (3,):
+            check_shape("background", background, (samples.num_rays, 3))
+        background = background.to(rgb.dtype).expand(samples.num_rays, 3)
+        rgb = rgb + (1 - opacity)[:, None] * background
+    return Rendering(
+        rgb=rgb,
+        opacity=opacity,
+        depth=safe_divide(depth, opacity),
+        background=background,
+        weights=weights,
+        samples=samples,
+        output=output,
+    )

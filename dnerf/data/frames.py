@@ -1,0 +1,188 @@
+"""Pictures of a moving scene held as uint8, each with its camera pose and time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dnerf.backgrounds import parse_color
+from dnerf.cameras import Camera, Intrinsics, camera_rays
+from dnerf.checks import check_shape
+from dnerf.rays import Rays
+
+RIGID_TOLERANCE = 1e-3
+
+
+def composite_on(rgba: Tensor, background: Tensor) -> Tensor:
+    """Put premultiplied colour on a background: `rgb + (1 - alpha) background`.
+
+    Args:
+        rgba: (..., 4) in [0, 1], colour already multiplied by alpha.
+        background: broadcastable to (..., 3), in [0, 1].
+
+    Returns:
+        (..., 3) in [0, 1].
+
+    Raises:
+        ValueError: if the last axes are not 4 and 3 long.
+    """
+    if rgba.shape[-1:] != (4,) or background.shape[-1:] != (3,):
+        raise ValueError(
+            "rgba and background must have shapes (..., 4) and (..., 3), "
+            f"got {tuple(rgba.shape)} and {tuple(background.shape)}"
+        )
+    return rgba[..., :3] + (1 - rgba[..., 3:]) * background
+
+
+def is_rigid(poses: Tensor) -> Tensor:
+    """Whether poses (..., 4, 4) are finite, with a rotation (to 1e-3) and the last row 0 0 0 1; (...) bool."""
+    rotation = poses[..., :3, :3]
+    identity = torch.eye(3, dtype=poses.dtype, device=poses.device)
+    deviation = (rotation @ rotation.mT - identity).abs().amax(dim=(-2, -1))
+    last_row = (poses[..., 3, :] - torch.tensor([0.0, 0, 0, 1], dtype=poses.dtype, device=poses.device)).abs()
+    # Comparisons with NaN are false, so a NaN anywhere in the rotation or the last row is refused as well.
+    proper = (deviation <= RIGID_TOLERANCE) & (torch.linalg.det(rotation) > 0)
+    return proper & (last_row.amax(-1) <= RIGID_TOLERANCE) & poses.isfinite().all(-1).all(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """F pictures of one scene, each with a camera-to-world pose and a time; all share one pinhole camera.
+
+    With four channels the colour is **premultiplied** by alpha, rounded once to 8 bits, so that a picture on
+    background b is `images[..., :3] / 255 + (1 - images[..., 3] / 255) b`. Memory is that of `images`: 200 frames
+    of 400 x 400 with alpha take 128 MB.
+
+    Args:
+        images: (F, H, W, C) uint8, C = 3 (opaque) or 4 (premultiplied alpha).
+        poses: (F, 4, 4) float32, camera-to-world, rigid, OpenGL axes.
+        times: (F,) float32 in [0, 1].
+        intrinsics: camera with width W and height H.
+        near: z-depth where rays begin, in world units.
+        far: z-depth where rays end.
+        background: what opaque pictures (C = 3) show behind the scene, as a name or three numbers; None if unknown.
+        names: F names for messages and files, or none.
+
+    Raises:
+        ValueError: if shapes or types do not fit, a pose is not rigid or a time lies outside [0, 1].
+    """
+
+    images: Tensor
+    poses: Tensor
+    times: Tensor
+    intrinsics: Intrinsics
+    near: float = 2.0
+    far: float = 6.0
+    background: str | Sequence[float] | None = None
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        size = (self.intrinsics.height, self.intrinsics.width)
+        check_shape("images", self.images, ("F", *size, "3 or 4"))
+        num_frames, channels = self.images.shape[0], self.images.shape[-1]
+        if num_frames == 0 or channels not in (3, 4):
+            raise ValueError(f"images must have shape (F > 0, H, W, 3 or 4), got {tuple(self.images.shape)}")
+        check_shape("poses", self.poses, (num_frames, 4, 4))
+        check_shape("times", self.times, (num_frames,))
+        for name, dtype in (("images", torch.uint8), ("poses", torch.float32), ("times", torch.float32)):
+            if getattr(self, name).dtype != dtype:
+                raise ValueError(f"{name} must be {dtype}, got {getattr(self, name).dtype}")
+        if not self.images.is_contiguous():
+            raise ValueError("images must be contiguous, for pixels to be gathered without a copy")
+        rigid = is_rigid(self.poses)
+        if not bool(rigid.all()):
+            raise ValueError(f"poses must be rigid, pose {int((~rigid).nonzero()[0])} is not")
+        outside = ~((self.times >= 0) & (self.times <= 1))
+        if bool(outside.any()):
+            raise ValueError(f"times must be in [0, 1], got {float(self.times[outside][0])}")
+        if self.background is not None:
+            if channels == 4:
+                raise ValueError("background must be None for images with alpha, got a colour")
+            parse_color(self.background)
+        if self.names and len(self.names) != num_frames:
+            raise ValueError(f"names must be {num_frames} or none, got {len(self.names)}")
+        self.camera(0)  # checks the planes
+
+    def __len__(self) -> int:
+        return self.images.shape[0]
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the pictures have an alpha channel and so premultiplied colour."""
+        return self.images.shape[-1] == 4
+
+    @property
+    def num_pixels(self) -> int:
+        """Number of pixels of all frames together; `pixels` takes indices below it."""
+        return self.images.shape[0] * self.images.shape[1] * self.images.shape[2]
+
+    def camera(self, index: int) -> Camera:
+        """The camera of one frame."""
+        return Camera(self.intrinsics, self.poses[index], self.near, self.far)
+
+    def image(self, index: int, background: Sequence[float] | Tensor = (1.0, 1.0, 1.0)) -> Tensor:
+        """One picture on a background (3,), (H, W, 3) float32 in [0, 1]; opaque pictures ignore the background."""
+        color = torch.as_tensor(background, dtype=torch.float32, device=self.images.device)
+        check_shape("background", color, (3,))
+        picture = self.images[index].float() / 255
+        return composite_on(picture, color) if self.has_alpha else picture
+
+    def alpha(self, index: int) -> Tensor:
+        """One picture's alpha, (H, W) float32 in [0, 1]; 1 everywhere for opaque pictures."""
+        if not self.has_alpha:
+            return torch.ones(self.images.shape[1:3], device=self.images.device)
+        return self.images[index, ..., 3].float() / 255
+
+    def pixels(self, indices: Tensor) -> tuple[Rays, Tensor]:
+        """Rays and colours of any pixels of any frames.
+
+        Args:
+            indices: (B,) int64 in [0, num_pixels), on the device of the images: `(frame * H + row) * W + column`.
+
+        Returns:
+            B rays, each at its frame's time, and their colours (B, 4) float32, premultiplied (alpha 1 if opaque).
+
+        Raises:
+            ValueError: if indices are not a row of int64.
+        """
+        check_shape("indices", indices, ("B",))
+        if indices.dtype != torch.int64:
+            raise ValueError(f"indices must be int64, got {indices.dtype}")
+        _, height, width, channels = self.images.shape
+        rgba = self.images.view(-1, channels).index_select(0, indices).float() / 255
+        if not self.has_alpha:
+            rgba = torch.nn.functional.pad(rgba, (0, 1), value=1.0)
+        rows = indices // width
+        frames = rows // height
+        rays = camera_rays(
+            self.intrinsics,
+            self.poses.index_select(0, frames),
+            indices - rows * width,
+            rows - frames * height,
+            times=self.times.index_select(0, frames),
+            near=self.near,
+            far=self.far,
+        )
+        return rays, rgba
+
+    def subset(self, indices: Sequence[int]) -> "Frames":
+        """The frames with the given indices, in that order (a copy).
+
+        Raises:
+            ValueError: if there are none, or one does not exist.
+        """
+        if not len(indices) or not all(-len(self) <= i < len(self) for i in indices):
+            raise ValueError(f"indices must name some of {len(self)} frames, got {list(indices)[:8]}")
+        chosen = torch.as_tensor([i % len(self) for i in indices], device=self.images.device)
+        return replace(
+            self,
+            images=self.images.index_select(0, chosen),
+            poses=self.poses.index_select(0, chosen),
+            times=self.times.index_select(0, chosen),
+            names=tuple(self.names[i] for i in indices) if self.names else (),
+        )
+
+    def to(self, device: str | torch.device) -> "Frames":
+        """The same frames on another device."""
+        return replace(self, images=self.images.to(device), poses=self.poses.to(device), times=self.times.to(device))

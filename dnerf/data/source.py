@@ -1,0 +1,110 @@
+"""Where frames come from: a folder in D-NeRF's format, or an analytic scene."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from dnerf.backgrounds import parse_color
+from dnerf.checks import as_box, check_choice
+from dnerf.data.blender import load_blender
+from dnerf.data.frames import Frames
+from dnerf.data.synthetic import random_views, render_frames
+from dnerf.scenes import AnalyticScene
+
+SPLITS = ("train", "val", "test")
+
+
+class DataSource(ABC):
+    """Frames of a scene by split, and the box its matter lies in."""
+
+    box: Tensor  # (2, 3), in world units
+
+    @abstractmethod
+    def frames(self, split: str) -> Frames:
+        """Frames of "train", "val" or "test".
+
+        Raises:
+            ValueError: for another split or broken data.
+        """
+
+
+class BlenderData(DataSource):
+    """A scene folder in D-NeRF's format.
+
+    Args:
+        root: folder that holds `transforms_<split>.json`.
+        resolution: width in pixels after area averaging; None keeps the files' size.
+        box: (2, 3) corners of what is modelled, in world units.
+        near: z-depth where rays begin.
+        far: z-depth where they end.
+        pixel_origin: "center", or "corner" as D-NeRF's code.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        resolution: int | None = 400,
+        box: Sequence[Sequence[float]] = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)),
+        *,
+        near: float = 2.0,
+        far: float = 6.0,
+        pixel_origin: str = "center",
+    ) -> None:
+        self.root = root
+        self.resolution = resolution
+        self.box = as_box(box)
+        self.near = near
+        self.far = far
+        self.pixel_origin = pixel_origin
+
+    def frames(self, split: str) -> Frames:
+        """Read a split; see `load_blender` for what can be wrong with it."""
+        check_choice("split", split, SPLITS)
+        return load_blender(
+            self.root, split, self.resolution, near=self.near, far=self.far, pixel_origin=self.pixel_origin
+        )
+
+
+class SyntheticData(DataSource):
+    """Exact frames of an analytic scene: random views of the upper half space, training times evenly over [0, 1].
+
+    Test and validation times lie midway between training times, so they are unseen.
+
+    Args:
+        scene: what is rendered.
+        resolution: width and height in pixels.
+        box: (2, 3) corners of what is modelled, in world units.
+        num_train: frames of the train split.
+        num_val: frames of the val split.
+        num_test: frames of the test split.
+        seed: of the random views.
+        background: colour behind the frames, which have no alpha then; None keeps alpha.
+    """
+
+    def __init__(
+        self,
+        scene: AnalyticScene,
+        resolution: int = 200,
+        box: Sequence[Sequence[float]] = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)),
+        *,
+        num_train: int = 100,
+        num_val: int = 10,
+        num_test: int = 20,
+        seed: int = 0,
+        background: str | Sequence[float] | None = None,
+    ) -> None:
+        self.scene = scene
+        self.resolution = resolution
+        self.box = as_box(box)
+        self.num_frames = {"train": num_train, "val": num_val, "test": num_test}
+        self.seed = seed
+        self.background = None if background is None else parse_color(background)
+
+    def frames(self, split: str) -> Frames:
+        """Render a split exactly."""
+        check_choice("split", split, SPLITS)
+        poses, times = random_views(
+            self.num_frames[split], midway=split != "train", seed=self.seed + 1000 * SPLITS.index(split)
+        )
+        return render_frames(self.scene, poses, times, self.resolution, background=self.background)

@@ -1,0 +1,42 @@
+"""What a deformation is: a map from world to canonical positions, one time per position."""
+
+from abc import ABC, abstractmethod
+
+from torch import Tensor, nn
+
+from dnerf.checks import check_batch
+from dnerf.geometry import check_last_axis
+
+
+class Deformation(nn.Module, ABC):
+    """Maps world positions at their times to canonical positions."""
+
+    @abstractmethod
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Canonical positions of world positions.
+
+        Args:
+            positions: (..., 3) in world units.
+            times: (...,) in [0, 1], one per position.
+
+        Returns:
+            (..., 3) canonical positions in world units: positions, never offsets.
+        """
+
+
+class InvertibleDeformation(Deformation):
+    """A deformation that can also carry canonical positions back to the world."""
+
+    @abstractmethod
+    def inverse(self, canonical: Tensor, times: Tensor) -> Tensor:
+        """World positions (..., 3) at `times` (...,) of canonical positions (..., 3)."""
+
+
+def check_positions_times(positions: Tensor, times: Tensor) -> None:
+    """Raise unless positions are (..., 3) and times have their batch shape.
+
+    Raises:
+        ValueError: naming the argument and its shape.
+    """
+    check_last_axis("positions", positions, 3)
+    check_batch("times", times, positions)

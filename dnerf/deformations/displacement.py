@@ -1,0 +1,66 @@
+"""The D-NeRF deformation: an MLP of position and time displaces each sample."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dnerf.deformations.base import Deformation, check_positions_times
+from dnerf.encodings import SinusoidalEncoding
+from dnerf.mlp import MLP
+
+
+class DisplacementDeformation(Deformation):
+    """Displacement by an MLP: x' = x + (t - t0) f(x, t), the identity at the canonical time by construction.
+
+    Source: D-NeRF (arXiv 2011.13961) eq. 3. D-NeRF branches in code on t = 0, which breaks the map's continuity and
+    wants one time per batch; the factor (t - t0) gives the same identity smoothly and per sample. With
+    `canonical_time=None` there is no factor and no canonical time: x' = x + f(x, t).
+
+    Args:
+        num_layers: hidden layers of the MLP.
+        hidden_features: their width.
+        skips: hidden layers that see the encoded input again.
+        position_frequencies: octaves of the positions' sinusoidal encoding.
+        time_frequencies: octaves of the times' encoding.
+        canonical_time: t0 in [0, 1], or None.
+        window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
+
+    Raises:
+        ValueError: if the canonical time lies outside [0, 1].
+    """
+
+    def __init__(
+        self,
+        num_layers: int = 8,
+        hidden_features: int = 256,
+        skips: Sequence[int] = (5,),
+        *,
+        position_frequencies: int = 10,
+        time_frequencies: int = 10,
+        canonical_time: float | None = 0.0,
+        window_end: float | None = None,
+    ) -> None:
+        super().__init__()
+        if canonical_time is not None and not 0 <= canonical_time <= 1:
+            raise ValueError(f"canonical_time must be in [0, 1] or None, got {canonical_time}")
+        self.canonical_time = canonical_time
+        self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
+        self.encode_times = SinusoidalEncoding(1, time_frequencies)
+        self.mlp = MLP(
+            self.encode_positions.out_features + self.encode_times.out_features,
+            hidden_features,
+            num_layers,
+            out_features=3,
+            skips=skips,
+            zero_output=True,
+        )
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Canonical positions (..., 3) of world positions (..., 3) at times (...,)."""
+        check_positions_times(positions, times)
+        encoded = torch.cat([self.encode_positions(positions), self.encode_times(times[..., None])], dim=-1)
+        offsets = self.mlp(encoded).to(positions.dtype)
+        if self.canonical_time is not None:
+            offsets = offsets * (times[..., None] - self.canonical_time)
+        return positions + offsets

@@ -1,0 +1,115 @@
+"""Fixed encodings of positions, times and directions."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.checks import check_choice, check_positive
+from dnerf.geometry import check_last_axis
+
+
+class SinusoidalEncoding(nn.Module):
+    """Sines and cosines of a value at doubling frequencies: (x, sin(2^k x), cos(2^k x)), k < num_frequencies.
+
+    Source: NeRF (arXiv 2003.08934) eq. 4, without its factor pi, as D-NeRF's code has it. With
+    `window_end`, frequency k fades in while training goes on (Nerfies, arXiv 2011.12948, eq. 8):
+    w_k = (1 - cos(pi clamp(a - k, 0, 1))) / 2 with a = num_frequencies * progress / window_end.
+
+    Args:
+        num_dims: D, size of the last axis of the input.
+        num_frequencies: number of octaves, >= 0.
+        include_input: whether the value itself comes first.
+        window_end: fraction of the training, in (0, 1], at which every frequency is fully in; None for no window.
+
+    Raises:
+        ValueError: for an encoding of size zero or a window outside (0, 1].
+    """
+
+    def __init__(
+        self, num_dims: int, num_frequencies: int, include_input: bool = True, *, window_end: float | None = None
+    ) -> None:
+        super().__init__()
+        check_positive("num_dims", num_dims)
+        check_positive("num_frequencies", num_frequencies, allow_zero=include_input)
+        if window_end is not None and not 0 < window_end <= 1:
+            raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
+        self.num_dims = num_dims
+        self.num_frequencies = num_frequencies
+        self.include_input = include_input
+        self.window_end = window_end
+        self.out_features = num_dims * (2 * num_frequencies + include_input)
+        self.register_buffer("frequencies", 2.0 ** torch.arange(num_frequencies), persistent=False)
+        weights = torch.zeros(num_frequencies) if window_end is not None else torch.ones(num_frequencies)
+        self.register_buffer("window", weights, persistent=window_end is not None)
+        self.frequencies: Tensor
+        self.window: Tensor
+
+    def set_progress(self, progress: float) -> None:
+        """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
+        if self.window_end is None:
+            return
+        alpha = self.num_frequencies * min(progress / self.window_end, 1.0)
+        octaves = torch.arange(self.num_frequencies, device=self.window.device)
+        self.window.copy_(0.5 * (1 - torch.cos(math.pi * (alpha - octaves).clamp(0, 1))))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Encode (..., D) -> (..., D * (2 * num_frequencies + include_input)), in the input's dtype."""
+        check_last_axis("values", values, self.num_dims)
+        angles = (values[..., None, :] * self.frequencies.to(values.dtype)[:, None]).flatten(-2)
+        waves = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1)
+        if self.window_end is not None:
+            waves = waves * self.window.to(values.dtype).repeat_interleave(self.num_dims).repeat(2)
+        return torch.cat([values, waves], dim=-1) if self.include_input else waves
+
+
+class SphericalHarmonicsEncoding(nn.Module):
+    """Real spherical harmonics of a unit direction up to a degree: (degree + 1)^2 numbers.
+
+    Source: Sloan, "Efficient Spherical Harmonic Evaluation" (JCGT 2013); orthonormal on the sphere, with the
+    signs of the usual graphics convention (Condon-Shortley phase included).
+
+    Args:
+        degree: 0 to 3.
+
+    Raises:
+        ValueError: for another degree.
+    """
+
+    def __init__(self, degree: int = 3) -> None:
+        super().__init__()
+        check_choice("degree", degree, (0, 1, 2, 3))
+        self.degree = degree
+        self.out_features = (degree + 1) ** 2
+
+    def forward(self, directions: Tensor) -> Tensor:
+        """Encode unit directions (..., 3) -> (..., (degree + 1)^2)."""
+        check_last_axis("directions", directions, 3)
+        x, y, z = directions.unbind(-1)
+        terms = [torch.full_like(x, 0.5 * math.sqrt(1 / math.pi))]
+        if self.degree >= 1:
+            c = math.sqrt(3 / (4 * math.pi))
+            terms += [-c * y, c * z, -c * x]
+        if self.degree >= 2:
+            c = math.sqrt(15 / math.pi)
+            xx, yy, zz = x * x, y * y, z * z
+            terms += [
+                c / 2 * x * y,
+                -c / 2 * y * z,
+                math.sqrt(5 / math.pi) / 4 * (2 * zz - xx - yy),
+                -c / 2 * x * z,
+                c / 4 * (xx - yy),
+            ]
+        if self.degree >= 3:
+            a, b = math.sqrt(35 / (2 * math.pi)) / 4, math.sqrt(21 / (2 * math.pi)) / 4
+            c, d = math.sqrt(105 / math.pi) / 4, math.sqrt(7 / math.pi) / 4
+            terms += [
+                -a * y * (3 * xx - yy),
+                2 * c * x * y * z,
+                -b * y * (4 * zz - xx - yy),
+                d * z * (2 * zz - 3 * xx - 3 * yy),
+                -b * x * (4 * zz - xx - yy),
+                c * z * (xx - yy),
+                -a * x * (xx - 3 * yy),
+            ]
+        return torch.stack(terms, dim=-1)

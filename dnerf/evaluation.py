@@ -1,0 +1,106 @@
+"""Scoring a renderer on frames it has not seen."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from dnerf.data.frames import Frames
+from dnerf.metrics import psnr, ssim
+from dnerf.renderer import Renderer
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """Score of one frame.
+
+    Args:
+        index: in its split.
+        time: in [0, 1].
+        psnr: in dB.
+        ssim: in [-1, 1].
+    """
+
+    index: int
+    time: float
+    psnr: float
+    ssim: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of a split: means over its frames, and each frame's.
+
+    Args:
+        split: name of the split.
+        psnr: mean of the frames' PSNR, in dB.
+        ssim: mean of the frames' SSIM.
+        num_frames: number of frames.
+        seconds_per_frame: mean wall-clock seconds to render one.
+        frames: each frame's score.
+    """
+
+    split: str
+    psnr: float
+    ssim: float
+    num_frames: int
+    seconds_per_frame: float
+    frames: Sequence[FrameScore]
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values, ready for JSON."""
+        return asdict(self)
+
+
+FrameCallback = Callable[[FrameScore, Tensor, Tensor], None]
+
+
+def evaluate(
+    renderer: Renderer,
+    frames: Frames,
+    split: str = "test",
+    *,
+    chunk: int = 16384,
+    on_frame: FrameCallback | None = None,
+) -> Evaluation:
+    """Render every frame and compare it with the truth on the renderer's own (evaluation) background.
+
+    Pictures are compared as floats in [0, 1]: predictions clamped, truths as stored in 8 bits.
+
+    Args:
+        renderer: the model.
+        frames: the split's frames.
+        split: its name, for the report.
+        chunk: rays rendered at a time.
+        on_frame: called with score, prediction (H, W, 3) and truth (H, W, 3) of every frame.
+    """
+    device = next(renderer.parameters()).device
+    frames = frames.to(device)
+    was_training = renderer.training
+    renderer.eval()
+    background = renderer.background(torch.zeros(1, 3, device=device))[0]
+    scores, seconds = [], 0.0
+    for i in range(len(frames)):
+        camera, moment = frames.camera(i), float(frames.times[i])
+        begin = time.perf_counter()
+        prediction = renderer.render_image(camera, moment, chunk=chunk).rgb.clamp(0, 1)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds += time.perf_counter() - begin
+        truth = frames.image(i, background)
+        score = FrameScore(i, moment, psnr(prediction, truth), ssim(prediction, truth))
+        scores.append(score)
+        if on_frame is not None:
+            on_frame(score, prediction, truth)
+    renderer.train(was_training)
+    return Evaluation(
+        split=split,
+        psnr=fmean(s.psnr for s in scores),
+        ssim=fmean(s.ssim for s in scores),
+        num_frames=len(scores),
+        seconds_per_frame=seconds / len(scores),
+        frames=scores,
+    )

@@ -1,0 +1,9 @@
+"""Radiance fields: density and colour at positions, directions and times."""
+
+from dnerf.compositing import FieldOutput
+from dnerf.fields.base import RadianceField
+from dnerf.fields.deformed import DeformedField
+from dnerf.fields.grid import GridField
+from dnerf.fields.nerf import NeRFField
+
+__all__ = ["DeformedField", "FieldOutput", "GridField", "NeRFField", "RadianceField"]

@@ -1,0 +1,47 @@
+"""Density activations, safe in value and gradient."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from dnerf.checks import check_choice
+
+DENSITY_ACTIVATIONS = ("softplus", "exp")
+
+
+class _TruncatedExp(torch.autograd.Function):
+    """exp clamped to e^15 in value, its gradient to e^15 as well, so that neither overflows (instant-ngp)."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        result = torch.exp(x.clamp(max=15.0))
+        ctx.save_for_backward(result)
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (result,) = ctx.saved_tensors
+        return grad * result
+
+
+def truncated_exp(x: Tensor) -> Tensor:
+    """exp(min(x, 15)) whose gradient keeps pulling beyond the clamp: d/dx = exp(min(x, 15)) everywhere."""
+    return _TruncatedExp.apply(x)
+
+
+def activate_density(raw: Tensor, activation: str, shift: float) -> Tensor:
+    """Density (>= 0, float32 at least) of a network's raw output.
+
+    Args:
+        raw: (...,) network output; half precision is raised to float32 first.
+        activation: "softplus" (mip-NeRF) or "exp" (truncated, instant-ngp).
+        shift: added before the activation; negative for a thin start, which keeps gradients alive.
+
+    Raises:
+        ValueError: for another activation.
+    """
+    check_choice("activation", activation, DENSITY_ACTIVATIONS)
+    raw = (raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw) + shift
+    return softplus(raw) if activation == "softplus" else truncated_exp(raw)

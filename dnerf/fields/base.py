@@ -1,0 +1,28 @@
+"""What a radiance field is: density and colour at positions and times."""
+
+from abc import ABC, abstractmethod
+
+from torch import Tensor, nn
+
+from dnerf.compositing import FieldOutput
+
+
+class RadianceField(nn.Module, ABC):
+    """Density and colour of light at world positions and times."""
+
+    @abstractmethod
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Density (...,) >= 0 in 1 / world unit at positions (..., 3) and times (...,) in [0, 1]."""
+
+    @abstractmethod
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        """Density and colour.
+
+        Args:
+            positions: (..., 3) in world units.
+            directions: (..., 3) unit viewing directions, from the eye into the scene.
+            times: (...,) in [0, 1].
+
+        Returns:
+            `FieldOutput` with density (...,) and rgb (..., 3) in [0, 1].
+        """

@@ -1,0 +1,36 @@
+"""A canonical field seen through a deformation: every dynamic model of the package."""
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from dnerf.compositing import FieldOutput
+from dnerf.deformations.base import Deformation
+from dnerf.fields.base import RadianceField
+
+
+class DeformedField(RadianceField):
+    """The canonical field at deformed positions: (density, rgb)(x, d, t) = canonical(deformation(x, t), d, t).
+
+    Viewing directions are not turned by the deformation (as in D-NeRF). Its output carries the extra
+    "canonical_positions" (..., 3).
+
+    Args:
+        deformation: world -> canonical.
+        canonical: field in canonical space; it may use the time as well.
+    """
+
+    def __init__(self, deformation: Deformation, canonical: RadianceField) -> None:
+        super().__init__()
+        self.deformation = deformation
+        self.canonical = canonical
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Density (...,) at positions (..., 3) and times (...,)."""
+        return self.canonical.density(self.deformation(positions, times), times)
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        """Density (...,) and rgb (..., 3) at positions (..., 3), directions (..., 3) and times (...,)."""
+        canonical_positions = self.deformation(positions, times)
+        output = self.canonical(canonical_positions, directions, times)
+        return replace(output, extras={**output.extras, "canonical_positions": canonical_positions})

@@ -1,0 +1,104 @@
+"""A multi-resolution feature grid with a tiny head as a canonical field."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.checks import as_box, check_positive
+from dnerf.compositing import FieldOutput
+from dnerf.deformations.base import check_positions_times
+from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
+from dnerf.fields.activations import activate_density
+from dnerf.fields.base import RadianceField
+from dnerf.kernels import GridLevels, grid_encode
+from dnerf.mlp import MLP
+
+
+class GridField(RadianceField):
+    """Features interpolated in grids of several resolutions, then a small MLP for density and colour.
+
+    Source: instant-ngp (Mueller et al. 2022): levels are dense while their vertices fit into `max_rows` rows and
+    hashed beyond. Cells are cubes: a resolution counts cells along the box's longest side. Parts a scene does not
+    need do not exist: no time features without `time_frequencies`, no directions without `view_degree`.
+
+    Args:
+        box: (2, 3) corners of the modelled space; positions outside see the features of the nearest face.
+        resolutions: cells along the longest side, per level.
+        num_features: features per level, F.
+        max_rows: most table rows of a level, a power of two.
+        hidden_features: width of the head.
+        num_layers: hidden layers of the head.
+        time_frequencies: octaves of a time encoding that the head sees (shading and topology that change); None for
+            a field that does not depend on time.
+        view_degree: spherical-harmonics degree of the direction that a second, colour-only head sees; None for matte.
+        density_activation: "softplus" or "exp".
+        density_shift: added before the activation; negative for a thin start.
+
+    Raises:
+        ValueError: for a box, resolutions or sizes out of range.
+    """
+
+    def __init__(
+        self,
+        box: Sequence[Sequence[float]],
+        resolutions: Sequence[int] = (16, 32, 64, 128),
+        num_features: int = 8,
+        *,
+        max_rows: int = 1 << 17,
+        hidden_features: int = 64,
+        num_layers: int = 2,
+        time_frequencies: int | None = None,
+        view_degree: int | None = None,
+        density_activation: str = "exp",
+        density_shift: float = -1.0,
+    ) -> None:
+        super().__init__()
+        check_positive("num_features", num_features)
+        corners = as_box(box)
+        sides = corners[1] - corners[0]
+        cells = [[max(1, round(r * float(s / sides.max()))) for s in sides] for r in resolutions]
+        self.levels = GridLevels(cells, max_rows)
+        self.density_activation = density_activation
+        self.density_shift = density_shift
+        self.register_buffer("low", corners[0], persistent=False)
+        self.register_buffer("scale", 1 / sides, persistent=False)
+        self.low: Tensor
+        self.scale: Tensor
+        self.table = nn.Parameter(torch.empty(self.levels.num_rows, num_features).uniform_(-1e-2, 1e-2))
+        self.encode_times = None if time_frequencies is None else SinusoidalEncoding(1, time_frequencies)
+        self.encode_directions = None if view_degree is None else SphericalHarmonicsEncoding(view_degree)
+        in_features = num_features * self.levels.num_levels
+        if self.encode_times is not None:
+            in_features += self.encode_times.out_features
+        if self.encode_directions is None:
+            self.head = MLP(in_features, hidden_features, num_layers, out_features=4)
+        else:
+            self.head = MLP(in_features, hidden_features, num_layers, out_features=1 + hidden_features)
+            self.to_rgb = MLP(
+                hidden_features + self.encode_directions.out_features, hidden_features, 1, out_features=3
+            )
+
+    def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
+        check_positions_times(positions, times)
+        unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
+        features = grid_encode(unit.reshape(-1, 3), self.table, self.levels).unflatten(0, positions.shape[:-1])
+        if self.encode_times is not None:
+            features = torch.cat([features, self.encode_times(times[..., None])], dim=-1)
+        return self.head(features)
+
+    def _density(self, raw: Tensor) -> Tensor:
+        return activate_density(raw[..., 0], self.density_activation, self.density_shift)
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Density (...,) at canonical positions (..., 3) and times (...,)."""
+        return self._density(self._raw(positions, times))
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        """Density (...,) and rgb (..., 3) at canonical positions (..., 3), directions (..., 3) and times (...,)."""
+        raw = self._raw(positions, times)
+        density = self._density(raw)
+        color = raw[..., 1:]
+        if self.encode_directions is not None:
+            color = self.to_rgb(torch.cat([torch.relu(color), self.encode_directions(directions)], dim=-1))
+        return FieldOutput(density=density, rgb=torch.sigmoid(color.to(density.dtype)))

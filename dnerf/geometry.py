@@ -1,0 +1,159 @@
+"""Rays against boxes, rotations and rigid motions, each safe in value and gradient at its bad point."""
+
+import torch
+from torch import Tensor
+
+from dnerf.checks import check_shape
+
+
+def ray_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances at which lines enter and leave an axis-aligned box (slab method).
+
+    A line that misses has `enter > leave`. A line along an axis, or lying in a face, is handled exactly: a zero
+    direction component gives (-inf, inf) inside the slab, its faces included, and (inf, -inf) outside.
+
+    Args:
+        origins: (R, 3) in world units.
+        directions: (R, 3).
+        box: (2, 3) lowest and highest corner.
+
+    Returns:
+        enter, leave: (R,) each, in units of the direction's length; `enter` is negative for origins inside.
+    """
+    check_shape("box", box, (2, 3))
+    low, high = box[0] - origins, box[1] - origins
+    parallel = directions == 0
+    safe = torch.where(parallel, torch.ones_like(directions), directions)
+    first, second = low / safe, high / safe
+    inside = (low <= 0) & (high >= 0)
+    infinity = torch.full_like(first, torch.inf)
+    unbounded = torch.where(inside, -infinity, infinity)
+    enter = torch.where(parallel, unbounded, torch.minimum(first, second)).amax(-1)
+    leave = torch.where(parallel, -unbounded, torch.maximum(first, second)).amin(-1)
+    return enter, leave
+
+
+def clip_to_box(
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, box: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Shorten [near, far] to its part inside a box; rays without one get the empty interval far = near.
+
+    Args and Returns as `ray_box`; near and far are (R,) and finite, so are the results.
+    """
+    enter, leave = ray_box(origins, directions, box)
+    start, end = torch.maximum(near, enter), torch.minimum(far, leave)
+    hits = end > start
+    return torch.where(hits, start, near), torch.where(hits, end, near)
+
+
+def skew(vectors: Tensor) -> Tensor:
+    """Cross-product matrices: (..., 3) -> (..., 3, 3) with `skew(a) @ b = a x b`."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
+    return rows.reshape(*vectors.shape[:-1], 3, 3)
+
+
+def _outer_minus_square(vectors: Tensor) -> Tensor:
+    """Squares of cross-product matrices: (..., 3) -> (..., 3, 3), `v v^T - |v|^2 I`.
+
+    Without a matrix product, which autocast would run in bfloat16 and some GPUs in tf32.
+    """
+    eye = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
+    squared = (vectors * vectors).sum(-1)[..., None, None]
+    return vectors[..., :, None] * vectors[..., None, :] - squared * eye
+
+
+def _rotate(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Matrices (..., 3, 3) times vectors (..., 3), broadcasting, in full precision under autocast too."""
+    return (matrices * vectors[..., None, :]).sum(-1)
+
+
+def _rotation_coefficients(rotation_vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of the angle a, smooth at zero; shape (..., 1, 1) each.
+
+    The closed forms lose half their digits to cancellation well before a = 0, so the Taylor branch begins at
+    a^2 = 0.25, where eight terms are exact to float64 rounding.
+    """
+    squared = (rotation_vectors * rotation_vectors).sum(-1)[..., None, None]
+    small = squared < 0.25
+    angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    closed = (
+        torch.sin(angle) / angle,
+        2 * (torch.sin(0.5 * angle) / angle) ** 2,
+        (angle - torch.sin(angle)) / angle**3,
+    )
+    near_zero = torch.where(small, squared, torch.zeros_like(squared))
+    results = []
+    for first, exact in zip((1, 2, 3), closed):
+        term = torch.ones_like(near_zero) / (1, 1, 2, 6)[first]
+        series = term
+        for k in range(1, 9):
+            term = -term * near_zero / ((2 * k + first - 1) * (2 * k + first))
+            series = series + term
+        results.append(torch.where(small, series, exact))
+    return results[0], results[1], results[2]
+
+
+def so3_exp(rotation_vectors: Tensor) -> Tensor:
+    """Rotation matrices of rotation vectors (Rodrigues), smooth in value and gradient at zero.
+
+    Args:
+        rotation_vectors: (..., 3), axis times angle in radians.
+
+    Returns:
+        (..., 3, 3) rotation matrices for column vectors.
+    """
+    check_last_axis("rotation_vectors", rotation_vectors, 3)
+    a, b, _ = _rotation_coefficients(rotation_vectors)
+    cross = skew(rotation_vectors)
+    eye = torch.eye(3, dtype=cross.dtype, device=cross.device)
+    return eye + a * cross + b * _outer_minus_square(rotation_vectors)
+
+
+def se3_exp(twists: Tensor) -> Tensor:
+    """Rigid motions of twists, smooth in value and gradient at zero (Murray, Li, Sastry 1994, eq. 2.36).
+
+    Args:
+        twists: (..., 6): rotation vector in radians, then translational velocity in world units.
+
+    Returns:
+        (..., 4, 4) homogeneous matrices for column vectors.
+    """
+    check_last_axis("twists", twists, 6)
+    rotation_vectors, velocities = twists[..., :3], twists[..., 3:]
+    a, b, c = _rotation_coefficients(rotation_vectors)
+    cross = skew(rotation_vectors)
+    squared = _outer_minus_square(rotation_vectors)
+    eye = torch.eye(3, dtype=cross.dtype, device=cross.device)
+    rotation = eye + a * cross + b * squared
+    translation = _rotate(eye + b * cross + c * squared, velocities)[..., None]
+    bottom = torch.zeros_like(twists[..., :4])
+    bottom[..., 3] = 1
+    return torch.cat([torch.cat([rotation, translation], -1), bottom[..., None, :]], -2)
+
+
+def transform_points(matrices: Tensor, points: Tensor) -> Tensor:
+    """Apply homogeneous matrices (..., 4, 4) to points (..., 3), broadcasting."""
+    return _rotate(matrices[..., :3, :3], points) + matrices[..., :3, 3]
+
+
+def safe_normalize(vectors: Tensor) -> Tensor:
+    """Unit vectors (..., 3); a zero vector stays zero with zero gradient."""
+    # Scaled first, since squares of float32 lengths below 1e-19 or above 1e19 leave its range.
+    largest = vectors.detach().abs().amax(-1, keepdim=True)
+    zero = largest == 0
+    scaled = vectors / torch.where(zero, torch.ones_like(largest), largest)
+    squared = (scaled * scaled).sum(-1, keepdim=True)
+    unit = scaled * torch.where(zero, torch.ones_like(squared), squared).rsqrt()
+    return torch.where(zero, torch.zeros_like(vectors), unit)
+
+
+def check_last_axis(name: str, value: Tensor, size: int) -> None:
+    """Raise unless the last axis of `value` has the given size.
+
+    Raises:
+        ValueError: naming the argument and its shape.
+    """
+    if value.dim() == 0 or value.shape[-1] != size:
+        raise ValueError(f"{name} must have shape (..., {size}), got {tuple(value.shape)}")

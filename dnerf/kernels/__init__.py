@@ -1,0 +1,22 @@
+"""The few loops where the time goes: each a plain-torch definition with compiled versions that agree with it."""
+
+from .backend import BACKENDS, get_backend, set_backend, use_backend
+from .grid_encode import GridLevels, grid_encode
+from .march import MarchedSamples, march
+from .packed_sum import packed_sum
+from .packed_weights import packed_weights
+from .skip_distances import skip_distances
+
+__all__ = [
+    "BACKENDS",
+    "GridLevels",
+    "MarchedSamples",
+    "get_backend",
+    "grid_encode",
+    "march",
+    "packed_sum",
+    "packed_weights",
+    "set_backend",
+    "skip_distances",
+    "use_backend",
+]

@@ -1,0 +1,114 @@
+"""numba versions of `packed_weights` and `packed_sum` and their gradients."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from .launch import FAST, launch
+
+
+def weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
+    out = torch.empty_like(optical_depth, memory_format=torch.contiguous_format)
+    launch(_weights, _array(optical_depth), _checked(offsets, len(optical_depth)), out.numpy())
+    return out
+
+
+def grad_optical_depth(grad: Tensor, optical_depth: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
+    out = torch.empty_like(optical_depth, memory_format=torch.contiguous_format)
+    launch(
+        _grad_optical_depth,
+        _array(grad),
+        _array(optical_depth),
+        _array(weights),
+        _checked(offsets, len(optical_depth)),
+        out.numpy(),
+    )
+    return out
+
+
+def sums(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tensor:
+    out = values.new_empty((len(offsets) - 1, values.shape[1]))
+    launch(_sums, _array(values), _optional(weights), _checked(offsets, len(values)), out.numpy())
+    return out
+
+
+def grad_values(grad: Tensor, weights: Tensor | None, offsets: Tensor, num_samples: int) -> Tensor:
+    out = grad.new_empty((num_samples, grad.shape[1]))
+    launch(_grad_values, _array(grad), _optional(weights), _checked(offsets, num_samples), out.numpy())
+    return out
+
+
+def grad_weights(grad: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
+    out = grad.new_empty(len(values))
+    launch(_grad_weights, _array(grad), _array(values), _checked(offsets, len(values)), out.numpy())
+    return out
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def _optional(weights: Tensor | None) -> np.ndarray | None:
+    return None if weights is None else _array(weights)
+
+
+def _checked(offsets: Tensor, num_samples: int) -> np.ndarray:
+    array = _array(offsets)
+    if array[0] != 0 or array[-1] != num_samples:
+        raise ValueError(f"offsets must run from 0 to {num_samples}, got {array[0]} to {array[-1]}")
+    return array
+
+
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+def _weights(optical_depth: Any, offsets: Any, out: Any) -> None:
+    for r in prange(len(offsets) - 1):
+        before = optical_depth.dtype.type(0)
+        for i in range(offsets[r], offsets[r + 1]):
+            out[i] = math.exp(-before) * -math.expm1(-optical_depth[i])
+            before += optical_depth[i]
+
+
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+def _grad_optical_depth(grad: Any, optical_depth: Any, weights: Any, offsets: Any, out: Any) -> None:
+    """dL/dtau_j = g_j exp(-sum_{i<=j} tau_i) - sum_{i>j} g_i w_i."""
+    for r in prange(len(offsets) - 1):
+        through = optical_depth.dtype.type(0)
+        for i in range(offsets[r], offsets[r + 1]):
+            through += optical_depth[i]
+            out[i] = grad[i] * math.exp(-through)
+        behind = optical_depth.dtype.type(0)
+        for i in range(offsets[r + 1] - 1, offsets[r] - 1, -1):
+            out[i] -= behind
+            behind += grad[i] * weights[i]
+
+
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+def _sums(values: Any, weights: Any, offsets: Any, out: Any) -> None:
+    for r in prange(len(offsets) - 1):
+        for c in range(values.shape[1]):
+            total = values.dtype.type(0)
+            for i in range(offsets[r], offsets[r + 1]):
+                total += values[i, c] if weights is None else weights[i] * values[i, c]
+            out[r, c] = total
+
+
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+def _grad_values(grad: Any, weights: Any, offsets: Any, out: Any) -> None:
+    for r in prange(len(offsets) - 1):
+        for i in range(offsets[r], offsets[r + 1]):
+            for c in range(grad.shape[1]):
+                out[i, c] = grad[r, c] if weights is None else weights[i] * grad[r, c]
+
+
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+def _grad_weights(grad: Any, values: Any, offsets: Any, out: Any) -> None:
+    for r in prange(len(offsets) - 1):
+        for i in range(offsets[r], offsets[r + 1]):
+            total = values.dtype.type(0)
+            for c in range(values.shape[1]):
+                total += grad[r, c] * values[i, c]
+            out[i] = total

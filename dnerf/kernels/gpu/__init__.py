@@ -1,0 +1,1 @@
+"""Triton versions of the kernels, for CUDA tensors; they also run on the CPU under TRITON_INTERPRET=1."""

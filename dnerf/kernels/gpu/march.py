@@ -1,0 +1,130 @@
+# mypy: disallow_untyped_defs=False, disallow_incomplete_defs=False
+"""Triton version of `march`: one program per ray, a lane per interval."""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ..march import interval_ranges
+
+BLOCK = 64
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    occupancy: Tensor,
+    aabb: Tensor,
+    step: float,
+    max_samples_per_ray: int | None,
+    skips: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    num_rays = len(near)
+    shape = torch.tensor(occupancy.shape[1:], device=aabb.device, dtype=aabb.dtype)
+    arguments = (
+        origins.contiguous(),
+        directions.contiguous(),
+        near.contiguous(),
+        times.contiguous(),
+        jitter.contiguous(),
+        torch.stack((*interval_ranges(origins, directions, near, far, jitter, aabb, step),), -1),
+        occupancy.contiguous().view(torch.uint8),
+        aabb.contiguous(),
+        shape / (aabb[1] - aabb[0]),
+        origins.new_full((1,), step),
+        torch.iinfo(torch.int64).max if max_samples_per_ray is None else max_samples_per_ray,
+    )
+    offsets = torch.zeros(num_rays + 1, dtype=torch.int64, device=near.device)
+    # Fused multiply-adds would round differently from the definition.
+    options = {"num_warps": 1, "enable_fp_fusion": False}
+    if num_rays:
+        _march[(num_rays,)](
+            *arguments, offsets, near, near, offsets, *occupancy.shape, False, BLOCK, **options
+        )
+        torch.cumsum(offsets, 0, out=offsets)
+    # The number of samples decides the outputs' size: the one point where the host waits for the device.
+    num_samples = int(offsets[-1])
+    starts, ends = near.new_empty(num_samples), near.new_empty(num_samples)
+    ray_indices = offsets.new_empty(num_samples)
+    if num_samples:
+        _march[(num_rays,)](
+            *arguments, offsets, starts, ends, ray_indices, *occupancy.shape, True, BLOCK, **options
+        )
+    return starts, ends, ray_indices, offsets
+
+
+@triton.jit
+def _cell(
+    origins,
+    directions,
+    aabb,
+    scale,
+    ray,
+    middle,
+    axis: tl.constexpr,
+    size: tl.constexpr,
+):
+    position = tl.load(origins + ray * 3 + axis) + tl.load(directions + ray * 3 + axis) * middle
+    cell = (position - tl.load(aabb + axis)) * tl.load(scale + axis)
+    return tl.minimum(tl.maximum(cell, 0.0), size - 1.0).to(tl.int64)
+
+
+@triton.jit
+def _march(
+    origins,
+    directions,
+    near,
+    times,
+    jitter,
+    ranges,
+    occupancy,
+    aabb,
+    scale,
+    step,
+    limit,
+    offsets,
+    starts,
+    ends,
+    ray_indices,
+    num_slabs: tl.constexpr,
+    nx: tl.constexpr,
+    ny: tl.constexpr,
+    nz: tl.constexpr,
+    fill: tl.constexpr,
+    block: tl.constexpr,
+):
+    """Count a ray's kept intervals into `offsets[ray + 1]`, or write them from `offsets[ray]` on."""
+    ray = tl.program_id(0).to(tl.int64)
+    near_, jitter_, step_ = tl.load(near + ray), tl.load(jitter + ray), tl.load(step)
+    enter, leave = tl.load(ranges + ray * 4), tl.load(ranges + ray * 4 + 1)
+    first, count = tl.load(ranges + ray * 4 + 2), tl.load(ranges + ray * 4 + 3).to(tl.int64)
+    slab = tl.minimum(tl.maximum(tl.load(times + ray) * num_slabs, 0.0), num_slabs - 1.0).to(tl.int64)
+    output = tl.load(offsets + ray)
+    found = tl.zeros((), tl.int64)
+    j = tl.zeros((), tl.int64)
+    while (j < count) & (found < limit):
+        lanes = j + tl.arange(0, block)
+        index = first + lanes.to(near_.dtype)
+        start = tl.maximum(near_ + (index - 1 + jitter_) * step_, enter)
+        end = tl.minimum(near_ + (index + jitter_) * step_, leave)
+        middle = (start + end) * 0.5
+        x = _cell(origins, directions, aabb, scale, ray, middle, 0, nx)
+        y = _cell(origins, directions, aabb, scale, ray, middle, 1, ny)
+        z = _cell(origins, directions, aabb, scale, ray, middle, 2, nz)
+        valid = (lanes < count) & (end > start)
+        keep = tl.load(occupancy + ((slab * nx + x) * ny + y) * nz + z, valid, 0).to(tl.int64)
+        rank = found + tl.cumsum(keep, 0) - keep
+        if fill:
+            write = (keep != 0) & (rank < limit)
+            tl.store(starts + output + rank, start, write)
+            tl.store(ends + output + rank, end, write)
+            tl.store(ray_indices + output + rank, tl.zeros_like(rank) + ray, write)
+        found += tl.sum(keep, 0)
+        j += block
+    if not fill:
+        tl.store(offsets + ray + 1, tl.minimum(found, limit))

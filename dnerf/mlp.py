@@ -1,0 +1,64 @@
+"""The multi-layer perceptron that fields and deformations share."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.checks import check_positive
+
+
+class MLP(nn.Module):
+    """Linear layers with ReLU between them; the input may be fed in again at hidden layers ("skips").
+
+    Args:
+        in_features: size of the input.
+        hidden_features: width of every hidden layer.
+        num_layers: number of hidden layers, >= 0; with 0 the network is one linear map.
+        out_features: size of the output; None ends after the last hidden layer, activation included.
+        skips: hidden layers, counted from 0, whose input is the previous activation and the network's input
+            (NeRF and D-NeRF: (5,) of eight).
+        zero_output: start the last linear map at zero, so that the network is zero at initialisation.
+
+    Raises:
+        ValueError: if sizes are not positive or a skip names no hidden layer but the first.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        hidden_features: int,
+        num_layers: int,
+        *,
+        out_features: int | None = None,
+        skips: Sequence[int] = (),
+        zero_output: bool = False,
+    ) -> None:
+        super().__init__()
+        check_positive("in_features", in_features)
+        check_positive("hidden_features", hidden_features)
+        check_positive("num_layers", num_layers, allow_zero=True)
+        if any(not 0 < skip < num_layers for skip in skips):
+            raise ValueError(f"skips must lie in 1..{num_layers - 1}, got {tuple(skips)}")
+        self.skips = frozenset(skips)
+        widths = [
+            (in_features if i == 0 else hidden_features) + (in_features if i in self.skips else 0)
+            for i in range(num_layers)
+        ]
+        self.hidden = nn.ModuleList(nn.Linear(width, hidden_features) for width in widths)
+        last = hidden_features if num_layers else in_features
+        self.output = None if out_features is None else nn.Linear(last, out_features)
+        self.out_features = last if out_features is None else out_features
+        for layer in self.hidden:
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)
+        if zero_output and self.output is not None:
+            nn.init.zeros_(self.output.weight)
+            nn.init.zeros_(self.output.bias)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map (..., in_features) -> (..., out_features)."""
+        x = inputs
+        for i, layer in enumerate(self.hidden):
+            x = torch.relu(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
+        return x if self.output is None else self.output(x)

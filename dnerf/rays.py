@@ -1,0 +1,151 @@
+"""Rays and the samples along them: the data that every sampler, field and compositor exchange."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from dnerf.checks import check_shape
+
+if TYPE_CHECKING:
+    from dnerf.compositing import FieldOutput
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A batch of R rays, each with its own time.
+
+    Args:
+        origins: (R, 3) in world units.
+        directions: (R, 3), unit norm.
+        times: (R,) in [0, 1].
+        near: (R,) distance along the direction where the ray begins, in world units.
+        far: (R,) distance where it ends; `far <= near` is an empty ray.
+
+    Raises:
+        ValueError: if a shape does not fit.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    times: Tensor
+    near: Tensor
+    far: Tensor
+
+    def __post_init__(self) -> None:
+        check_shape("origins", self.origins, ("R", 3))
+        num_rays = len(self)
+        check_shape("directions", self.directions, (num_rays, 3))
+        for name in ("times", "near", "far"):
+            check_shape(name, getattr(self, name), (num_rays,))
+
+    def __len__(self) -> int:
+        return self.origins.shape[0]
+
+    def __getitem__(self, index: slice | Tensor) -> "Rays":
+        return self._map(lambda x: x[index])
+
+    def to(self, *args: Any, **kwargs: Any) -> "Rays":
+        """Move or cast every tensor, with the arguments of `Tensor.to`."""
+        return self._map(lambda x: x.to(*args, **kwargs))
+
+    def _map(self, function: Callable[[Tensor], Tensor]) -> "Rays":
+        return Rays(**{f.name: function(getattr(self, f.name)) for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Intervals along R rays, dense (R, S) or packed (N,), and the point of each where the field is asked.
+
+    Intervals of a ray are ordered and do not overlap; an interval of length zero adds nothing.
+
+    Args:
+        starts: (R, S) or (N,) distance where an interval begins, in world units.
+        ends: same shape, `ends >= starts`.
+        num_rays: R.
+        ray_indices: None for dense samples; for packed ones (N,) int64, sorted, the ray of each sample.
+        points: same shape as starts, the distance at which the field is evaluated; the interval's middle if None.
+            Stratified sampling and Gauss quadrature set it.
+        ray_offsets: packed only, (R + 1,) int64: samples of ray r are `ray_offsets[r]:ray_offsets[r + 1]`;
+            derived from `ray_indices` if None.
+        proposals: earlier passes (coarse samples and what a field said there) that placed these samples;
+            losses read them.
+
+    Raises:
+        ValueError: if shapes do not fit each other.
+    """
+
+    starts: Tensor
+    ends: Tensor
+    num_rays: int
+    ray_indices: Tensor | None = None
+    points: Tensor | None = None
+    ray_offsets: Tensor | None = None
+    proposals: "tuple[tuple[Samples, FieldOutput], ...]" = ()
+
+    def __post_init__(self) -> None:
+        if self.ray_indices is None:
+            check_shape("starts", self.starts, (self.num_rays, "S"))
+        else:
+            check_shape("starts", self.starts, ("N",))
+            check_shape("ray_indices", self.ray_indices, self.starts.shape)
+        check_shape("ends", self.ends, self.starts.shape)
+        if self.points is not None:
+            check_shape("points", self.points, self.starts.shape)
+        if self.ray_offsets is not None:
+            check_shape("ray_offsets", self.ray_offsets, (self.num_rays + 1,))
+
+    @property
+    def is_packed(self) -> bool:
+        """Whether samples lie in one row (N,) with `ray_indices`, rather than in a table (R, S)."""
+        return self.ray_indices is not None
+
+    @cached_property
+    def lengths(self) -> Tensor:
+        """Interval lengths, same layout as `starts`, in world units."""
+        return self.ends - self.starts
+
+    @cached_property
+    def distances(self) -> Tensor:
+        """Distances along the rays at which the field is evaluated, same layout as `starts`."""
+        return 0.5 * (self.starts + self.ends) if self.points is None else self.points
+
+    @cached_property
+    def offsets(self) -> Tensor:
+        """(R + 1,) int64, where each ray's packed samples begin and end."""
+        if self.ray_offsets is not None:
+            return self.ray_offsets
+        if self.ray_indices is None:
+            raise ValueError("samples must be packed to have offsets, got dense samples")
+        rays = torch.arange(self.num_rays + 1, device=self.starts.device)
+        return torch.searchsorted(self.ray_indices, rays)
+
+    def per_sample(self, values: Tensor) -> Tensor:
+        """Give each sample its ray's value: (R, ...) -> (R, S, ...) or (N, ...)."""
+        if self.ray_indices is not None:
+            return values.index_select(0, self.ray_indices)
+        return values[:, None].expand(-1, self.starts.shape[1], *values.shape[1:])
+
+    def positions(self, rays: Rays) -> Tensor:
+        """World positions at which the field is evaluated, (R, S, 3) or (N, 3)."""
+        return torch.addcmul(
+            self.per_sample(rays.origins), self.distances[..., None], self.per_sample(rays.directions)
+        )
+
+    def packed(self, mask: Tensor | None = None) -> "Samples":
+        """Return dense samples as packed ones, only those where `mask` (R, S) holds (all if None)."""
+        if self.ray_indices is not None:
+            raise ValueError("samples must be dense to be packed, got packed samples")
+        if mask is None:
+            mask = torch.ones_like(self.starts, dtype=torch.bool)
+        check_shape("mask", mask, self.starts.shape)
+        return replace(
+            self,
+            starts=self.starts[mask],
+            ends=self.ends[mask],
+            points=None if self.points is None else self.points[mask],
+            ray_indices=mask.nonzero()[:, 0],
+        )

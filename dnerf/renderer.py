@@ -1,0 +1,102 @@
+"""The renderer: rays -> sampler -> field -> composite. It is the whole trainable model."""
+
+import torch
+from torch import nn
+
+from dnerf.backgrounds import Background, ConstantBackground
+from dnerf.cameras import Camera
+from dnerf.checks import check_choice, check_positive
+from dnerf.compositing import Rendering, composite
+from dnerf.fields.base import RadianceField
+from dnerf.rays import Rays
+from dnerf.samplers.base import Sampler
+
+PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
+
+
+class Renderer(nn.Module):
+    """Renders rays of a radiance field; the one module that is trained, saved and shared between processes.
+
+    Args:
+        field: what is rendered.
+        sampler: where along rays it is evaluated.
+        background: what lies behind; white if None.
+        precision: "float32", or "bfloat16" to run networks under autocast; positions, encodings and compositing stay
+            float32 either way.
+
+    Raises:
+        ValueError: for another precision.
+    """
+
+    def __init__(
+        self,
+        field: RadianceField,
+        sampler: Sampler,
+        background: Background | None = None,
+        *,
+        precision: str = "float32",
+    ) -> None:
+        super().__init__()
+        check_choice("precision", precision, tuple(PRECISIONS))
+        self.field = field
+        self.sampler = sampler
+        self.background = ConstantBackground("white") if background is None else background
+        self.precision = precision
+
+    def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Rendering:
+        """Render R rays.
+
+        Args:
+            rays: R rays.
+            generator: randomness of samplers and backgrounds in training mode.
+        """
+        dtype = PRECISIONS[self.precision]
+        with torch.autocast(rays.origins.device.type, dtype=dtype, enabled=dtype is not None):
+            samples = self.sampler(rays, self.field, generator=generator)
+            directions = samples.per_sample(rays.directions)
+            output = self.field(samples.positions(rays), directions, samples.per_sample(rays.times))
+        background = self.background(rays.directions, generator=generator)
+        rendering = composite(samples, output, background)
+        if not samples.proposals:
+            return rendering
+        proposals = tuple(composite(placed, said, background) for placed, said in samples.proposals)
+        return Rendering(**{**vars(rendering), "proposals": proposals})
+
+    def set_progress(self, progress: float) -> None:
+        """Tell every module that changes while training goes on (encoding windows) where it stands, in [0, 1]."""
+        for module in self.modules():
+            if module is not self and hasattr(module, "set_progress"):
+                module.set_progress(progress)
+
+    @torch.no_grad()
+    def render_image(self, camera: Camera, time: float, *, chunk: int = 16384) -> Rendering:
+        """Render a whole image in evaluation mode, without gradients.
+
+        Args:
+            camera: the view, on the model's device.
+            time: in [0, 1].
+            chunk: rays rendered at a time; bounds the memory.
+
+        Returns:
+            A `Rendering` with rgb (H, W, 3), opacity and depth (H, W); no per-sample data.
+
+        Raises:
+            ValueError: for a time outside [0, 1] or a chunk that is not positive.
+        """
+        check_positive("chunk", chunk)
+        if not 0 <= time <= 1:
+            raise ValueError(f"time must be in [0, 1], got {time}")
+        rays = camera.rays(time)
+        modes = [(module, module.training) for module in self.modules()]
+        self.eval()
+        try:
+            parts = [self(rays[i : i + chunk]) for i in range(0, len(rays), chunk)]
+        finally:
+            for module, mode in modes:
+                module.training = mode
+        shape = (camera.intrinsics.height, camera.intrinsics.width)
+        return Rendering(
+            rgb=torch.cat([p.rgb for p in parts]).reshape(*shape, 3),
+            opacity=torch.cat([p.opacity for p in parts]).reshape(shape),
+            depth=torch.cat([p.depth for p in parts]).reshape(shape),
+        )

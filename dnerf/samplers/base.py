@@ -1,0 +1,43 @@
+"""What a sampler is: it decides where along the rays a field is evaluated."""
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import nn
+
+from dnerf.compositing import FieldOutput
+from dnerf.fields.base import RadianceField
+from dnerf.rays import Rays, Samples
+
+
+class Sampler(nn.Module, ABC):
+    """Places samples along rays. Training mode may place them at random, evaluation mode never does."""
+
+    @abstractmethod
+    def forward(
+        self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None
+    ) -> Samples:
+        """Samples along R rays, dense or packed; no gradient flows to where they lie.
+
+        Args:
+            rays: R rays.
+            field: the field that will be rendered; samplers that look where matter is ask it.
+            generator: source of randomness in training mode.
+        """
+
+    def update(self, field: RadianceField, step: int) -> None:  # noqa: B027 - a hook: most samplers learn nothing
+        """Learn from the field between training steps; does nothing unless overridden.
+
+        Args:
+            field: the field in training.
+            step: number of training steps done so far.
+        """
+
+    def observe(self, rays: Rays, samples: Samples, output: FieldOutput) -> None:  # noqa: B027 - as above
+        """Learn from what the field said at the samples of a training step; does nothing unless overridden.
+
+        Args:
+            rays: the step's rays.
+            samples: where they were sampled.
+            output: the field's output there.
+        """

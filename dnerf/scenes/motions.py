@@ -1,0 +1,178 @@
+"""Motions of bodies: poses as smooth functions of time, composed like the links of a chain."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from dnerf.geometry import so3_exp
+from dnerf.scenes.poses import Pose
+
+Vector = tuple[float, float, float]
+
+
+def constant(values: Vector, like: Tensor) -> Tensor:
+    """Three numbers as a (3,) tensor with another tensor's device and dtype."""
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+
+@dataclass(frozen=True)
+class Wave:
+    """Sum of sines: mean + sum_k amplitude_k sin(2 pi (cycles_k t + phase_k)).
+
+    With whole numbers of cycles it is the same at t = 1 as at t = 0.
+
+    Args:
+        mean: value around which it swings.
+        harmonics: (amplitude, cycles, phase) each, the phase in turns.
+    """
+
+    mean: float = 0.0
+    harmonics: tuple[Vector, ...] = ()
+
+    def __call__(self, times: Tensor) -> Tensor:
+        """Value (...,) at times (...,)."""
+        value = torch.full_like(times, self.mean)
+        for amplitude, cycles, phase in self.harmonics:
+            value = value + amplitude * torch.sin(2 * math.pi * (cycles * times + phase))
+        return value
+
+
+class Motion(ABC):
+    """Where a body's frame is at each time."""
+
+    @abstractmethod
+    def pose(self, times: Tensor) -> Pose:
+        """Pose of the frame in the world at times (...,)."""
+
+
+@dataclass(frozen=True)
+class Fixed(Motion):
+    """A frame that never moves.
+
+    Args:
+        translation: its origin in world units.
+        rotation_vector: axis times angle in radians.
+    """
+
+    translation: Vector = (0.0, 0.0, 0.0)
+    rotation_vector: Vector = (0.0, 0.0, 0.0)
+
+    def pose(self, times: Tensor) -> Pose:
+        """The same pose at every time."""
+        rotation = so3_exp(constant(self.rotation_vector, times))
+        translation = constant(self.translation, times)
+        shape = times.shape
+        return Pose(rotation.expand(*shape, 3, 3), translation.expand(*shape, 3), torch.ones_like(times))
+
+
+@dataclass(frozen=True)
+class Orbit(Motion):
+    """A circle run through at constant speed without turning the frame: shading baked into a texture stays put.
+
+    Args:
+        radius: of the circle, in world units.
+        turns: circles run through while t goes from 0 to 1; negative runs clockwise.
+        phase: where it starts, in turns.
+        tilt: angle of the circle's plane about the x axis, in radians.
+        center: of the circle.
+    """
+
+    radius: float
+    turns: float = 1.0
+    phase: float = 0.0
+    tilt: float = 0.0
+    center: Vector = (0.0, 0.0, 0.0)
+
+    def pose(self, times: Tensor) -> Pose:
+        """Pose on the circle."""
+        angle = 2 * math.pi * (self.turns * times + self.phase)
+        along, across = self.radius * torch.cos(angle), self.radius * torch.sin(angle)
+        circle = torch.stack([along, across * math.cos(self.tilt), across * math.sin(self.tilt)], dim=-1)
+        identity = Pose.identity(times)
+        return Pose(identity.rotation, circle + constant(self.center, times), identity.scale)
+
+
+@dataclass(frozen=True)
+class Joint(Motion):
+    """A frame hinged to a parent's at a point, turning about an axis.
+
+    Args:
+        parent: motion of the frame it hangs on.
+        offset: the joint, in the parent's frame.
+        axis: unit vector in the parent's frame.
+        angle: in radians.
+    """
+
+    parent: Motion = field(default_factory=Fixed)
+    offset: Vector = (0.0, 0.0, 0.0)
+    axis: Vector = (0.0, 0.0, 1.0)
+    angle: Wave = field(default_factory=Wave)
+
+    def pose(self, times: Tensor) -> Pose:
+        """The parent's pose, then the joint's."""
+        rotation = so3_exp(self.angle(times)[..., None] * constant(self.axis, times))
+        offset = constant(self.offset, times).expand(*times.shape, 3)
+        return self.parent.pose(times).then(Pose(rotation, offset, torch.ones_like(times)))
+
+
+@dataclass(frozen=True)
+class Spin(Motion):
+    """A frame that turns at constant speed relative to its parent.
+
+    Args:
+        parent: motion of the frame it turns in.
+        axis: unit vector in the parent's frame.
+        turns: while t goes from 0 to 1.
+    """
+
+    parent: Motion = field(default_factory=Fixed)
+    axis: Vector = (0.0, 0.0, 1.0)
+    turns: float = 1.0
+
+    def pose(self, times: Tensor) -> Pose:
+        """The parent's pose, then the turn."""
+        rotation = so3_exp((2 * math.pi * self.turns * times)[..., None] * constant(self.axis, times))
+        identity = Pose.identity(times)
+        return self.parent.pose(times).then(Pose(rotation, identity.translation, identity.scale))
+
+
+@dataclass(frozen=True)
+class Slide(Motion):
+    """A frame that moves to and fro along an axis of its parent.
+
+    Args:
+        parent: motion of the frame it slides in.
+        axis: direction in the parent's frame.
+        distance: along the axis, in world units if the axis is a unit vector.
+    """
+
+    parent: Motion = field(default_factory=Fixed)
+    axis: Vector = (0.0, 0.0, 1.0)
+    distance: Wave = field(default_factory=Wave)
+
+    def pose(self, times: Tensor) -> Pose:
+        """The parent's pose, then the shift."""
+        shift = self.distance(times)[..., None] * constant(self.axis, times)
+        identity = Pose.identity(times)
+        return self.parent.pose(times).then(Pose(identity.rotation, shift, identity.scale))
+
+
+@dataclass(frozen=True)
+class Pulse(Motion):
+    """A frame that grows and shrinks about its origin.
+
+    Args:
+        parent: motion of the frame it pulses in.
+        scale: factor, positive at all times.
+    """
+
+    parent: Motion = field(default_factory=Fixed)
+    scale: Wave = field(default_factory=lambda: Wave(1.0))
+
+    def pose(self, times: Tensor) -> Pose:
+        """The parent's pose, then the scaling."""
+        identity = Pose.identity(times)
+        return self.parent.pose(times).then(Pose(identity.rotation, identity.translation, self.scale(times)))

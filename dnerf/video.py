@@ -1,0 +1,251 @@
+"""Moving pictures to files: MP4, GIF and PNG frames; contact sheets and pictures of an error."""
+
+import itertools
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from dnerf.checks import check_choice, check_positive
+from dnerf.files import atomic_path
+
+FORMATS = ("mp4", "gif", "png")
+MAX_GIF_FPS = 50
+
+# Every 16th colour of matplotlib's "inferno" (S. van der Walt, N. Smith, CC0); interpolated to within 0.03.
+INFERNO = (
+    "000004 0b0724 210c4a 3d0965 57106e 71196e 8a226a a32c61 bc3754 d24644 e45a31 f1731d f98e09 fcac11 f9cb35 f2ea69 "
+    "fcffa4"
+)
+
+
+def to_uint8(images: Tensor | NDArray) -> Tensor:
+    """Round colours in [0, 1] to 8 bits, to the nearest; what lies outside is clamped and uint8 passes unchanged.
+
+    Raises:
+        ValueError: if a value is not finite, or the type is neither float nor uint8.
+    """
+    tensor = torch.as_tensor(images)
+    if tensor.dtype == torch.uint8:
+        return tensor
+    if not tensor.is_floating_point():
+        raise ValueError(f"images must be float or uint8, got {tensor.dtype}")
+    if not bool(tensor.isfinite().all()):
+        raise ValueError("images must be finite, got NaN or infinity")
+    return (tensor.detach().float().clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def write_frames(
+    images: Iterable[Tensor | NDArray],
+    path: str | Path,
+    format: str | None = None,
+    *,
+    fps: float = 30.0,
+    quality: float = 8.0,
+) -> Path:
+    """Write pictures as one MP4 or GIF, or as a folder of `frame_00000.png`, ....
+
+    - mp4: H.264 in yuv420p with BT.709 colours, which every player shows. It needs even sizes: an odd one repeats
+      its last row or column. Frames stream to the encoder; memory is that of one.
+    - gif: loops for ever, 256 colours per frame. Its clock ticks in 1/100 s: frames last for a changing number of
+      ticks (at 30 fps 3, 4, 3, ...) such that none begins more than half a tick off and the whole is right.
+      Equal neighbours are merged. Compressed frames are held until the end.
+    - png: frames stream to the folder; an existing folder is replaced if it holds nothing but such frames.
+
+    The file appears when it is complete: a temporary one beside it is renamed, and removed upon any error.
+
+    Args:
+        images: (H, W, 3) each, float in [0, 1] or uint8, all of one size; may be a generator.
+        path: the file or folder to write; missing parent folders are made.
+        format: "mp4", "gif" or "png"; by the path's suffix if None ("png" if it has none).
+        fps: frames per second, at most 50 for gif (players slow down what is faster).
+        quality: of mp4, 0 to 10 (constant rate factor 51 to 0).
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: for an unknown format, no frames, frames that differ in size or are no pictures, an impossible
+            fps or quality, a file name that ends otherwise, or a folder that holds other files.
+    """
+    path = Path(path)
+    format = format or path.suffix[1:].lower() or "png"
+    check_choice("format", format, FORMATS)
+    check_positive("fps", fps)
+    if format == "gif" and fps > MAX_GIF_FPS:
+        raise ValueError(f"fps must be at most {MAX_GIF_FPS} for gif, got {fps}")
+    if not 0 <= quality <= 10:
+        raise ValueError(f"quality must be in [0, 10], got {quality}")
+    pictures = _pictures(images)
+    if format == "png":
+        _write_folder(pictures, path)
+        return path
+    if path.suffix.lower() != f".{format}" or path.is_dir():
+        raise ValueError(f"path must be a file that ends in .{format}, got {path}")
+    with atomic_path(path) as temporary:
+        if format == "mp4":
+            _write_mp4(pictures, temporary, fps, quality)
+        else:
+            _write_gif(pictures, temporary, fps)
+    return path
+
+
+def write_png(image: Tensor | NDArray, path: str | Path) -> Path:
+    """Write one picture (H, W, 3), float in [0, 1] or uint8; the file appears when it is complete.
+
+    Raises:
+        ValueError: if it is no picture.
+    """
+    picture = next(_pictures([image]))
+    with atomic_path(Path(path)) as temporary:
+        Image.fromarray(picture).save(temporary, format="PNG")
+    return Path(path)
+
+
+def error_map(prediction: Tensor, target: Tensor, max_error: float = 0.2) -> Tensor:
+    """Colour each pixel by its absolute error, averaged over channels: black is 0, pale yellow `max_error` or more.
+
+    Args:
+        prediction: (H, W, 3) in [0, 1].
+        target: same shape.
+        max_error: the error that gets the brightest colour; state it beside the picture.
+
+    Returns:
+        (H, W, 3) float32 in [0, 1], in matplotlib's "inferno" colours.
+
+    Raises:
+        ValueError: if shapes differ or `max_error` is not positive.
+    """
+    check_positive("max_error", max_error)
+    if prediction.shape != target.shape or prediction.shape[-1:] != (3,):
+        raise ValueError(
+            "prediction and target must have one shape (H, W, 3), "
+            f"got {tuple(prediction.shape)} and {tuple(target.shape)}"
+        )
+    colors = torch.tensor([list(bytes.fromhex(color)) for color in INFERNO.split()], device=prediction.device) / 255
+    error = (prediction.detach().float() - target.float()).abs().mean(-1)
+    position = (error / max_error).clamp(0, 1) * (len(colors) - 1)
+    below = position.long().clamp(max=len(colors) - 2)
+    return torch.lerp(colors[below], colors[below + 1], (position - below)[..., None])
+
+
+def contact_sheet(
+    pictures: Sequence[Sequence[Tensor | NDArray]],
+    columns: Sequence[str],
+    rows: Sequence[str] = (),
+    *,
+    margin: int = 8,
+) -> Tensor:
+    """Lay pictures out as a table on white, each in a thin grey frame, with headings above and labels on the left.
+
+    Args:
+        pictures: rows of pictures (H, W, 3) of one size, float in [0, 1] or uint8, one per column.
+        columns: headings.
+        rows: a label for each row, or none.
+        margin: white pixels between and around, at least 1.
+
+    Returns:
+        (height, width, 3) uint8, for `write_png`.
+
+    Raises:
+        ValueError: if there are no pictures, numbers do not fit, or sizes differ.
+    """
+    check_positive("margin", margin)
+    if not pictures or not columns or any(len(row) != len(columns) for row in pictures):
+        raise ValueError(f"pictures must have rows of {len(columns)} > 0, got {[len(row) for row in pictures]}")
+    if rows and len(rows) != len(pictures):
+        raise ValueError(f"rows must be {len(pictures)} labels or none, got {len(rows)}")
+    tiles = list(_pictures(picture for row in pictures for picture in row))
+    height, width = tiles[0].shape[:2]
+    font = ImageFont.load_default(size=min(max(height / 18, 10), 28))
+    line = math.ceil(max(font.getbbox(text)[3] for text in (*columns, *rows)))
+    left = margin + (math.ceil(max(font.getlength(text) for text in rows)) + margin if rows else 0)
+    # A heading wider than its picture widens the column rather than run into the next.
+    step_x = max(width, *(math.ceil(font.getlength(text)) for text in columns)) + margin
+    step_y = max(height, line) + margin
+    top = line + 2 * margin
+    sheet = Image.new("RGB", (left + len(columns) * step_x, top + len(pictures) * step_y), "white")
+    draw = ImageDraw.Draw(sheet)
+    for column, text in enumerate(columns):
+        draw.text((left + column * step_x + width / 2, margin), text, fill="black", font=font, anchor="ma")
+    for row, text in enumerate(rows):
+        draw.text((margin, top + row * step_y + height / 2), text, fill="black", font=font, anchor="lm")
+    for index, tile in enumerate(tiles):
+        x, y = left + index % len(columns) * step_x, top + index // len(columns) * step_y
+        draw.rectangle((x - 1, y - 1, x + width, y + height), outline="lightgrey")
+        sheet.paste(Image.fromarray(tile), (x, y))
+    return torch.from_numpy(np.array(sheet))
+
+
+def _pictures(images: Iterable[Tensor | NDArray]) -> Iterator[NDArray[np.uint8]]:
+    """Check and round each picture as it comes, (H, W, 3) uint8 in memory order."""
+    shape = None
+    for index, image in enumerate(images):
+        picture = np.ascontiguousarray(to_uint8(image).cpu().numpy())
+        if picture.ndim != 3 or picture.shape[-1] != 3 or not picture.size:
+            raise ValueError(f"images[{index}] must have shape (H, W, 3), got {picture.shape}")
+        shape = shape or picture.shape
+        if picture.shape != shape:
+            raise ValueError(f"images[{index}] must have shape {shape} as the first, got {picture.shape}")
+        yield picture
+    if shape is None:
+        raise ValueError("images must hold at least one frame, got none")
+
+
+def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float, quality: float) -> None:
+    import imageio.v2 as imageio
+
+    first = next(pictures)
+    padding = ((0, first.shape[0] % 2), (0, first.shape[1] % 2), (0, 0))
+    # Without the matrix and its tags, players guess BT.601 or BT.709 by the picture's size, and colours shift.
+    colors = "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
+    writer: Any = imageio.get_writer(
+        path,
+        format="FFMPEG",
+        mode="I",
+        fps=fps,
+        codec="libx264",
+        quality=quality,
+        pixelformat="yuv420p",
+        macro_block_size=1,
+        ffmpeg_log_level="error",
+        output_params=[*colors.split(), "-movflags", "+faststart"],
+    )
+    with writer:
+        writer.append_data(np.pad(first, padding, mode="edge"))
+        for picture in pictures:
+            writer.append_data(np.pad(picture, padding, mode="edge"))
+
+
+def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    frames = [Image.fromarray(picture).quantize(256) for picture in pictures]
+    ticks = [math.floor(100 * index / fps + 0.5) for index in range(len(frames) + 1)]
+    durations = [10 * (after - before) for before, after in itertools.pairwise(ticks)]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+
+
+def _write_folder(pictures: Iterator[NDArray[np.uint8]], path: Path) -> None:
+    path = Path(os.path.abspath(path))
+    if os.path.lexists(path) and not (path.is_dir() and all(_is_frame(file.name) for file in path.iterdir())):
+        raise ValueError(f"path must be a new folder or one of earlier frames, got {path}, which holds other things")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        unfinished, replaced = Path(folder) / "unfinished", Path(folder) / "replaced"
+        unfinished.mkdir()
+        for index, picture in enumerate(pictures):
+            Image.fromarray(picture).save(unfinished / f"frame_{index:05d}.png")
+        if path.is_dir():
+            path.rename(replaced)
+        unfinished.rename(path)
+
+
+def _is_frame(name: str) -> bool:
+    return name.startswith("frame_") and name.endswith(".png")

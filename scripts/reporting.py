@@ -1,0 +1,75 @@
+"""What training and evaluation both report: metrics.json, a contact sheet, a table."""
+
+import json
+from pathlib import Path
+
+from torch import Tensor
+
+from dnerf.data import DataSource
+from dnerf.evaluation import FrameScore, evaluate
+from dnerf.files import write_json
+from dnerf.renderer import Renderer
+from dnerf.video import contact_sheet, error_map, write_png
+
+MAX_ROWS = 4
+
+
+def evaluate_run(folder: Path, renderer: Renderer, data: DataSource, split: str) -> dict[str, object]:
+    """Score a run on a split; write `metrics.json` and `contact_sheet_<split>.png` into its folder.
+
+    Raises:
+        ValueError: if `training.json` is missing or broken.
+    """
+    training = read_training(folder)
+    frames = data.frames(split)
+    shown = {round(k * (len(frames) - 1) / max(MAX_ROWS - 1, 1)) for k in range(MAX_ROWS)}
+    rows: list[list[Tensor]] = []
+    labels: list[str] = []
+
+    def keep(score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
+        if score.index in shown:
+            rows.append([prediction, truth, error_map(prediction, truth)])
+            labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")
+
+    metrics = {**evaluate(renderer, frames, split, on_frame=keep).as_dict(), **training}
+    write_png(contact_sheet(rows, columns=["prediction", "truth", "error"], rows=labels), sheet_path(folder, split))
+    write_json(folder / "metrics.json", metrics)
+    return metrics
+
+
+def sheet_path(folder: Path, split: str) -> Path:
+    """Where a split's contact sheet lies."""
+    return folder / f"contact_sheet_{split}.png"
+
+
+def read_training(folder: Path) -> dict[str, object]:
+    """The facts of a run's training: seconds, steps, parameters, seed.
+
+    Raises:
+        ValueError: if the file is missing or broken.
+    """
+    path = folder / "training.json"
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: not a readable JSON file; did the training finish? ({error})") from error
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected a mapping, got {type(values).__name__}")
+    return values
+
+
+def print_scores(metrics: dict[str, object], folder: Path) -> None:
+    """Print a table of the frames' scores, their mean, and where the files are."""
+    frames = metrics["frames"]
+    assert isinstance(frames, list)
+    print(f"{'frame':>6}  {'time':>5}  {'PSNR':>6}  {'SSIM':>6}")
+    for frame in frames:
+        print(f"{frame['index']:>6}  {frame['time']:>5.3f}  {frame['psnr']:>6.2f}  {frame['ssim']:>6.4f}")
+    print(f"{'mean':>6}  {'':>5}  {metrics['psnr']:>6.2f}  {metrics['ssim']:>6.4f}")
+    print(
+        f"{metrics['num_frames']} {metrics['split']} frames, {metrics['seconds_per_frame']:.3f} s a frame; "
+        f"trained {metrics['train_seconds']:.0f} s, {metrics['num_steps']} steps, "
+        f"{metrics['num_parameters']:,} parameters"
+    )
+    print(f"scores:        {folder / 'metrics.json'}")
+    print(f"contact sheet: {sheet_path(folder, str(metrics['split']))}")

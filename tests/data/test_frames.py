@@ -1,0 +1,192 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.cameras import Intrinsics, look_at
+from dnerf.data.frames import Frames, composite_on, is_rigid
+
+INTRINSICS = Intrinsics(5, 4, 6.0, 7.0)
+
+
+def make_frames(num_frames: int = 3, channels: int = 4, **changes: object) -> Frames:
+    generator = torch.Generator().manual_seed(1)
+    images = torch.randint(0, 256, (num_frames, 4, 5, channels), generator=generator, dtype=torch.uint8)
+    if channels == 4:
+        images[..., :3] = torch.minimum(images[..., :3], images[..., 3:])
+    arguments: dict = {
+        "images": images,
+        "poses": torch.stack([look_at((3.0, i + 0.5, 2.0)) for i in range(num_frames)]),
+        "times": torch.linspace(0, 1, num_frames),
+        "intrinsics": INTRINSICS,
+    }
+    return Frames(**{**arguments, **changes})
+
+
+def test_image_is_premultiplied_colour_plus_what_alpha_lets_through() -> None:
+    frames = make_frames()
+    background = (0.25, 0.5, 1.0)
+    image = frames.image(1, background).double()
+    raw = frames.images[1].double()
+    for row in range(4):
+        for column in range(5):
+            for c in range(3):
+                see_through = 1 - raw[row, column, 3] / 255
+                expected = raw[row, column, c] / 255 + see_through * background[c]
+                assert abs(image[row, column, c] - expected) < 3e-7  # float32
+    assert image.max() <= 1 + 1e-6
+
+
+def test_composite_on_is_exact_where_alpha_is_zero_or_one() -> None:
+    rgba = torch.tensor([[0.0, 0, 0, 0], [0.2, 0.4, 0.6, 1]])
+    out = composite_on(rgba, torch.tensor([1.0, 0.5, 0.0]))
+    assert torch.equal(out, torch.tensor([[1.0, 0.5, 0.0], [0.2, 0.4, 0.6]]))
+
+
+def test_composite_on_takes_a_background_per_pixel() -> None:
+    rgba, backgrounds = torch.rand(7, 4), torch.rand(7, 3)
+    each = torch.stack([composite_on(rgba[i], backgrounds[i]) for i in range(7)])
+    assert torch.equal(composite_on(rgba, backgrounds), each)
+
+
+@pytest.mark.parametrize(("rgba", "background"), [((2, 3), (3,)), ((2, 4), (4,)), ((), (3,))])
+def test_composite_on_refuses_other_channels(rgba: tuple[int, ...], background: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="rgba and background must have shapes"):
+        composite_on(torch.zeros(rgba), torch.zeros(background))
+
+
+def test_opaque_frames_ignore_the_background_and_have_alpha_one() -> None:
+    frames = make_frames(channels=3, background="white")
+    assert torch.equal(frames.image(0, (0.0, 1.0, 0.0)), frames.images[0].float() / 255)
+    assert torch.equal(frames.alpha(0), torch.ones(4, 5))
+    rays, rgba = frames.pixels(torch.tensor([0, 59]))
+    assert torch.equal(rgba[:, 3], torch.ones(2))
+    assert torch.equal(rgba[1, :3], frames.images[2, 3, 4].float() / 255)
+    assert len(rays) == 2
+
+
+def test_alpha_is_the_fourth_channel() -> None:
+    frames = make_frames()
+    assert torch.equal(frames.alpha(2), frames.images[2, :, :, 3].float() / 255)
+
+
+@pytest.mark.parametrize("pixel_origin", ["center", "corner"])
+def test_pixels_are_those_of_each_frames_camera(pixel_origin: str) -> None:
+    frames = make_frames(intrinsics=Intrinsics(5, 4, 6.0, 7.0, 2.0, 2.5, pixel_origin), near=1.0, far=3.0)
+    indices = torch.randperm(frames.num_pixels)
+    rays, rgba = frames.pixels(indices)
+    for position, index in enumerate(indices.tolist()):
+        frame, inside = divmod(index, 20)
+        whole = frames.camera(frame).rays(float(frames.times[frame]))
+        for name in ("origins", "directions", "times", "near", "far"):
+            torch.testing.assert_close(
+                getattr(rays, name)[position], getattr(whole, name)[inside], rtol=1e-6, atol=1e-6
+            )
+        row, column = divmod(inside, 5)
+        assert torch.equal(rgba[position], frames.images[frame, row, column].float() / 255)
+
+
+def test_pixels_of_no_index_are_no_rays() -> None:
+    rays, rgba = make_frames().pixels(torch.empty(0, dtype=torch.int64))
+    assert len(rays) == 0
+    assert rgba.shape == (0, 4)
+
+
+@pytest.mark.parametrize("index", [60, -1])
+def test_pixels_beyond_the_last_are_refused(index: int) -> None:
+    with pytest.raises(IndexError):
+        make_frames().pixels(torch.tensor([index]))
+
+
+@pytest.mark.parametrize("indices", [torch.zeros(2, 1, dtype=torch.int64), torch.zeros(2)])
+def test_pixels_needs_a_row_of_int64(indices: Tensor) -> None:
+    with pytest.raises(ValueError, match="indices must"):
+        make_frames().pixels(indices)
+
+
+def test_memory_is_one_byte_per_value() -> None:
+    frames = make_frames()
+    assert frames.images.element_size() * frames.images.numel() == 3 * 4 * 5 * 4
+    assert frames.num_pixels == 60
+    assert len(frames) == 3
+
+
+def test_subset_keeps_order_and_everything_else() -> None:
+    frames = make_frames(names=("a", "b", "c"), near=0.5, far=9.0)
+    part = frames.subset([2, 0, -1])
+    assert torch.equal(part.images, frames.images[[2, 0, 2]])
+    assert torch.equal(part.poses, frames.poses[[2, 0, 2]])
+    assert torch.equal(part.times, frames.times[[2, 0, 2]])
+    assert part.names == ("c", "a", "c")
+    assert (part.near, part.far, part.intrinsics) == (0.5, 9.0, INTRINSICS)
+
+
+@pytest.mark.parametrize("indices", [[], [3], [0, -4]])
+def test_subset_of_none_or_missing_frames_is_refused(indices: list[int]) -> None:
+    with pytest.raises(ValueError, match="indices must name some of 3 frames"):
+        make_frames().subset(indices)
+
+
+@pytest.mark.gpu
+def test_frames_move_to_the_gpu_and_give_the_same_pixels() -> None:
+    frames, indices = make_frames(), torch.arange(60)
+    rays, rgba = frames.pixels(indices)
+    moved_rays, moved_rgba = frames.to("cuda").pixels(indices.cuda())
+    assert moved_rgba.is_cuda
+    torch.testing.assert_close(moved_rgba.cpu(), rgba)
+    torch.testing.assert_close(moved_rays.directions.cpu(), rays.directions)
+
+
+def bad_pose(**entries: float) -> Tensor:
+    poses = make_frames().poses.clone()
+    for place, value in entries.items():
+        poses[1, int(place[1]), int(place[2])] = value
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"images": torch.zeros(3, 4, 6, 4, dtype=torch.uint8)}, "images must have shape"),
+        ({"images": torch.zeros(3, 4, 5, 2, dtype=torch.uint8)}, "images must have shape"),
+        ({"images": torch.zeros(0, 4, 5, 4, dtype=torch.uint8)}, "images must have shape"),
+        ({"images": torch.zeros(3, 4, 5, 4)}, "images must be torch.uint8"),
+        ({"images": torch.zeros(3, 4, 4, 5, dtype=torch.uint8).mT}, "images must be contiguous"),
+        ({"poses": torch.eye(4)}, "poses must have shape"),
+        ({"poses": torch.eye(4, dtype=torch.float64).expand(3, 4, 4)}, "poses must be torch.float32"),
+        ({"poses": bad_pose(_00=math.nan)}, "pose 1 is not"),
+        ({"poses": bad_pose(_03=math.inf)}, "pose 1 is not"),
+        ({"times": torch.zeros(3, 1)}, "times must have shape"),
+        ({"times": torch.tensor([0, 0.5, 1.001])}, "times must be in"),
+        ({"times": torch.tensor([-0.001, 0.5, 1])}, "times must be in"),
+        ({"times": torch.tensor([0, math.nan, 1])}, "times must be in"),
+        ({"near": 6.0, "far": 2.0}, "near and far"),
+        ({"background": "white"}, "background must be None"),
+        ({"names": ("a",)}, "names must be 3"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_frames(**changes)
+
+
+def test_unknown_background_of_opaque_frames_is_refused() -> None:
+    with pytest.raises(ValueError, match="color must be"):
+        make_frames(channels=3, background="pink")
+
+
+def test_rotations_are_rigid_and_what_is_nearly_one_is_not() -> None:
+    rotation = torch.eye(4, dtype=torch.float64)
+    rotation[:3, :3] = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64)).Q
+    rotation[:3, :3] *= torch.linalg.det(rotation[:3, :3])
+    rotation[:3, 3] = torch.tensor([1e4, -2, 3])
+    scaled, mirrored, sheared, projective, lost = (rotation.clone() for _ in range(5))
+    scaled[:3, :3] *= 1.01
+    mirrored[:3, 0] *= -1
+    sheared[:3, 0] += 0.02 * sheared[:3, 1]
+    projective[3, 2] = 0.1
+    lost[0, 3] = np.inf
+    expected = [True, False, False, False, False, False]
+    assert is_rigid(torch.stack([rotation, scaled, mirrored, sheared, projective, lost])).tolist() == expected

@@ -1,0 +1,31 @@
+import os
+import sys
+
+import pytest
+import torch
+
+# Triton reads this when it is imported: without a GPU its kernels run in the interpreter, on CPU tensors.
+if not torch.cuda.is_available() and "triton" not in sys.modules:
+    os.environ["TRITON_INTERPRET"] = "1"
+
+from dnerf import kernels
+
+
+@pytest.fixture(params=["numba", "triton"])
+def compiled(request):
+    """Select a compiled backend, and give the device that its tensors must be on."""
+    device = "cpu"
+    if request.param == "triton":
+        triton = pytest.importorskip("triton", reason="triton is not installed")
+        if torch.cuda.is_available():
+            device = "cuda"
+        elif not triton.knobs.runtime.interpret:
+            pytest.skip("no GPU, and triton was imported before it could be told to interpret")
+    with kernels.use_backend(request.param):
+        yield device
+
+
+@pytest.fixture
+def reference():
+    with kernels.use_backend("reference"):
+        yield

@@ -1,0 +1,73 @@
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from dnerf import kernels
+from dnerf.kernels import backend
+
+
+def test_unknown_backend_is_named():
+    with pytest.raises(ValueError, match="got 'cuda'"):
+        kernels.set_backend("cuda")
+
+
+def test_misspelt_environment_variable_is_named_on_first_use():
+    code = "import torch\nfrom dnerf import kernels\nkernels.packed_weights(torch.ones(1), torch.tensor([0, 1]))"
+    result = subprocess.run(
+        [sys.executable, "-c", code], env={"DNERF_KERNELS": "nunba"}, capture_output=True, text=True, check=False
+    )
+    assert "ValueError: kernel backend must be one of" in result.stderr
+    assert "'nunba'" in result.stderr
+
+
+def test_context_manager_restores_the_backend_after_an_error():
+    before = kernels.get_backend()
+    with pytest.raises(RuntimeError), kernels.use_backend("reference"):
+        assert kernels.get_backend() == "reference"
+        raise RuntimeError
+    assert kernels.get_backend() == before
+
+
+@pytest.mark.parametrize(
+    ("tensor", "expected"),
+    [
+        (torch.zeros(1), "numba"),
+        (torch.zeros(1, dtype=torch.float64), "numba"),
+        (torch.zeros(1, dtype=torch.bfloat16), "reference"),
+        (torch.zeros(1, device="meta"), "reference"),
+    ],
+)
+def test_auto_chooses_by_device_and_dtype(tensor, expected):
+    with kernels.use_backend("auto"):
+        assert backend.choose(tensor) == expected
+
+
+def test_numba_refuses_other_devices():
+    with kernels.use_backend("numba"), pytest.raises(ValueError, match="on the CPU, got meta"):
+        backend.choose(torch.zeros(1, device="meta"))
+
+
+def test_triton_refuses_cpu_tensors_unless_interpreted(monkeypatch):
+    pytest.importorskip("triton", reason="triton is not installed")
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    with kernels.use_backend("triton"), pytest.raises(ValueError, match="needs CUDA tensors"):
+        backend.choose(torch.zeros(1))
+
+
+def test_missing_triton_is_named(monkeypatch):
+    monkeypatch.setattr(backend, "has_triton", lambda: False)
+    with pytest.raises(ValueError, match="not installed"):
+        kernels.set_backend("triton")
+
+
+def test_kernels_may_run_in_several_python_threads():
+    depths = torch.rand(3000) * 0.1
+    offsets = torch.arange(0, 3001, 30)
+    with kernels.use_backend("numba"):
+        expected = kernels.packed_weights(depths, offsets)
+        with ThreadPoolExecutor(4) as pool:
+            results = list(pool.map(lambda _: kernels.packed_weights(depths, offsets), range(40)))
+    assert all(torch.equal(r, expected) for r in results)
