@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
@@ -11,7 +12,11 @@ from dnerf.files import atomic_path
 
 def save_weights(model: nn.Module, path: Path) -> None:
     """Write a model's parameters and buffers to `path` (safetensors)."""
-    tensors = {name: value.detach().contiguous().cpu() for name, value in model.state_dict().items()}
+    # Copies, because the format refuses tensors that share memory, as modules used twice in a model do.
+    tensors = {
+        name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        for name, value in model.state_dict().items()
+    }
     with atomic_path(path) as temporary:
         save_file(tensors, temporary)
 

@@ -71,7 +71,7 @@ class OpacityEntropyLoss(Loss):
         self.weight = weight
 
     def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
-        """Weighted mean of -o log o - (1 - o) log(1 - o), with o kept 1e-4 from 0 and 1 so that gradients stay finite."""
+        """Weighted mean of -o log o - (1 - o) log(1 - o); o is kept 1e-4 from 0 and 1, so that gradients are finite."""
         opacity = rendering.opacity.clamp(1e-4, 1 - 1e-4)
         entropy = -(opacity * torch.log(opacity) + (1 - opacity) * torch.log1p(-opacity))
         return self.weight * entropy.mean()

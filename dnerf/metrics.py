@@ -33,8 +33,9 @@ def ssim(prediction: Tensor, target: Tensor) -> float:
     """Mean structural similarity (Wang et al. 2004) of two pictures, through torchmetrics.
 
     Protocol: RGB, each channel on its own, Gaussian window of 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03, data
-    range 1, population variances, mean over channels and over the windows that lie inside the picture. The
-    prediction is clamped to [0, 1] first.
+    range 1, population variances, mean over channels and all pixels, pictures reflected by 5 pixels at their edges.
+    This is what torchmetrics reports since 1.6 (and nerfstudio with it); implementations that leave the outer 5
+    pixels out (Wang's, skimage's, multinerf's) differ in the third digit. The prediction is clamped to [0, 1] first.
 
     Args:
         prediction: (H, W, 3) float, H and W at least 11.
@@ -55,16 +56,17 @@ def ssim(prediction: Tensor, target: Tensor) -> float:
             f"prediction must have shape (H, W, 3) with H and W at least {SSIM_WINDOW}, got {tuple(prediction.shape)}"
         )
     dtype = torch.promote_types(torch.promote_types(prediction.dtype, target.dtype), torch.float32)
-    value = structural_similarity_index_measure(
+    # torchmetrics before 1.6 leaves the outer pixels out of the mean, but not out of the map.
+    _, similarities = structural_similarity_index_measure(
         prediction.to(dtype).clamp(0, 1).movedim(-1, 0)[None],
         target.to(dtype).movedim(-1, 0)[None],
         gaussian_kernel=True,
         sigma=SSIM_SIGMA,
         kernel_size=SSIM_WINDOW,
         data_range=1.0,
+        return_full_image=True,
     )
-    assert isinstance(value, Tensor)
-    return float(value)
+    return float(similarities.mean())
 
 
 def _check_pair(prediction: Tensor, target: Tensor) -> None:

@@ -50,8 +50,7 @@ class Renderer(nn.Module):
             rays: R rays.
             generator: randomness of samplers and backgrounds in training mode.
         """
-        dtype = PRECISIONS[self.precision]
-        with torch.autocast(rays.origins.device.type, dtype=dtype, enabled=dtype is not None):
+        with self._autocast(rays.origins.device):
             samples = self.sampler(rays, self.field, generator=generator)
             directions = samples.per_sample(rays.directions)
             output = self.field(samples.positions(rays), directions, samples.per_sample(rays.times))
@@ -61,6 +60,15 @@ class Renderer(nn.Module):
             return rendering
         proposals = tuple(composite(placed, said, background) for placed, said in samples.proposals)
         return Rendering(**{**vars(rendering), "proposals": proposals})
+
+    def update(self, step: int) -> None:
+        """Let the sampler learn from the field, between training steps; `step` counts those done."""
+        with self._autocast(next(self.parameters()).device):
+            self.sampler.update(self.field, step)
+
+    def _autocast(self, device: torch.device) -> torch.autocast:
+        dtype = PRECISIONS[self.precision]
+        return torch.autocast(device.type, dtype=dtype, enabled=dtype is not None)
 
     def set_progress(self, progress: float) -> None:
         """Tell every module that changes while training goes on (encoding windows) where it stands, in [0, 1]."""

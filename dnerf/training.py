@@ -61,7 +61,8 @@ class Trainer:
         target_samples: field evaluations per step; the number of rays is adapted to it (for samplers that skip empty
             space: rays that meet nothing cost nothing).
         max_rays: bound of the adapted number of rays.
-        learning_rates: by parameter-name prefix of the renderer ("" is the default, the longest match wins).
+        learning_rates: by parameter-name prefix of the renderer ("" is the default, the longest match wins); one that
+            matches nothing is ignored, so that one set serves models with and without a part.
         schedule: "exponential", "cosine" or "constant".
         final_learning_rate: factor at the end of the schedule.
         warmup_steps: steps over which the factor rises linearly from near zero.
@@ -156,7 +157,7 @@ class Trainer:
                 factor = self._learning_rate_factor(progress, step)
                 for group, rate in zip(optimizer.param_groups, base_rates):
                     group["lr"] = rate * factor
-                renderer.sampler.update(renderer.field, step)
+                renderer.update(step)
                 terms, num_samples, mse = self._step(renderer, frames, optimizer, num_rays, generator)
                 step += 1
                 used_rays, num_rays = num_rays, self._next_num_rays(num_rays, num_samples)
@@ -221,9 +222,6 @@ class Trainer:
         for name, parameter in renderer.named_parameters():
             prefix = max((p for p in groups if name.startswith(p)), key=len)
             groups[prefix].append(parameter)
-        unused = [prefix for prefix, parameters in groups.items() if prefix and not parameters]
-        if unused:
-            raise ValueError(f"learning_rates: no parameter's name begins with {unused[0]!r}")
         listed = [{"params": parameters, "lr": self.learning_rates[prefix]} for prefix, parameters in groups.items()]
         return torch.optim.Adam([g for g in listed if g["params"]], betas=self.betas, eps=self.epsilon, fused=True)
 

@@ -5,6 +5,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -169,17 +170,22 @@ def contact_sheet(
     line = math.ceil(max(font.getbbox(text)[3] for text in (*columns, *rows)))
     left = margin + (math.ceil(max(font.getlength(text) for text in rows)) + margin if rows else 0)
     # A heading wider than its picture widens the column rather than run into the next.
-    step_x = max(width, *(math.ceil(font.getlength(text)) for text in columns)) + margin
-    step_y = max(height, line) + margin
+    column_width = max(width, *(math.ceil(font.getlength(text)) for text in columns))
+    row_height = max(height, line)
     top = line + 2 * margin
-    sheet = Image.new("RGB", (left + len(columns) * step_x, top + len(pictures) * step_y), "white")
+    size = (left + len(columns) * (column_width + margin), top + len(pictures) * (row_height + margin))
+    sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
     for column, text in enumerate(columns):
-        draw.text((left + column * step_x + width / 2, margin), text, fill="black", font=font, anchor="ma")
+        x = left + column * (column_width + margin) + column_width / 2
+        draw.text((x, margin), text, fill="black", font=font, anchor="ma")
     for row, text in enumerate(rows):
-        draw.text((margin, top + row * step_y + height / 2), text, fill="black", font=font, anchor="lm")
+        y = top + row * (row_height + margin) + row_height / 2
+        draw.text((margin, y), text, fill="black", font=font, anchor="lm")
     for index, tile in enumerate(tiles):
-        x, y = left + index % len(columns) * step_x, top + index // len(columns) * step_y
+        row, column = divmod(index, len(columns))
+        x = left + column * (column_width + margin) + (column_width - width) // 2
+        y = top + row * (row_height + margin) + (row_height - height) // 2
         draw.rectangle((x - 1, y - 1, x + width, y + height), outline="lightgrey")
         sheet.paste(Image.fromarray(tile), (x, y))
     return torch.from_numpy(np.array(sheet))
@@ -202,6 +208,7 @@ def _pictures(images: Iterable[Tensor | NDArray]) -> Iterator[NDArray[np.uint8]]
 
 def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float, quality: float) -> None:
     import imageio.v2 as imageio
+    import imageio_ffmpeg
 
     first = next(pictures)
     padding = ((0, first.shape[0] % 2), (0, first.shape[1] % 2), (0, 0))
@@ -219,10 +226,19 @@ def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float, qu
         ffmpeg_log_level="error",
         output_params=[*colors.split(), "-movflags", "+faststart"],
     )
-    with writer:
-        writer.append_data(np.pad(first, padding, mode="edge"))
-        for picture in pictures:
+    num_frames = 0
+    # As a context manager the writer would leave the encoder running after an error.
+    with closing(writer):
+        for picture in itertools.chain([first], pictures):
             writer.append_data(np.pad(picture, padding, mode="edge"))
+            num_frames += 1
+    # The encoder's exit status is not looked at by imageio: a full disk would pass for success.
+    try:
+        num_found, _ = imageio_ffmpeg.count_frames_and_secs(path)
+    except RuntimeError as error:
+        raise OSError(f"{path}: ffmpeg could not complete the video") from error
+    if num_found != num_frames:
+        raise OSError(f"{path}: ffmpeg wrote {num_found} of {num_frames} frames")
 
 
 def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:

@@ -116,18 +116,14 @@ def sphere_quadrature(num_polar: int, num_around: int) -> tuple[Tensor, Tensor]:
     angles = 2 * math.pi * torch.arange(num_around, dtype=torch.float64) / num_around
     radii = (1 - heights**2).sqrt()
     around = torch.stack([angles.cos(), angles.sin()], -1)
-    points = torch.cat(
-        [radii[:, None, None] * around, heights[:, None, None].expand(num_polar, num_around, 1)], dim=-1
-    )
+    points = torch.cat([radii[:, None, None] * around, heights[:, None, None].expand(num_polar, num_around, 1)], dim=-1)
     return points.reshape(-1, 3), (weights[:, None] * (2 * math.pi / num_around)).expand(-1, num_around).flatten()
 
 
 class FormulaField(RadianceField):
     """A field without parameters: density of a position, colour of position, direction and time."""
 
-    def __init__(
-        self, density: Callable[[Tensor], Tensor], color: Callable[[Tensor, Tensor, Tensor], Tensor]
-    ) -> None:
+    def __init__(self, density: Callable[[Tensor], Tensor], color: Callable[[Tensor, Tensor, Tensor], Tensor]) -> None:
         super().__init__()
         self.density_of = density
         self.color_of = color

@@ -29,7 +29,9 @@ DTYPES = [torch.float64, torch.float32]
 both_layouts = pytest.mark.parametrize("layout", ["dense", "packed"])
 
 
-def uniform(near: float, far: float, num_samples: int, dtype: torch.dtype = torch.float64, num_rays: int = 1) -> Samples:
+def uniform(
+    near: float, far: float, num_samples: int, dtype: torch.dtype = torch.float64, num_rays: int = 1
+) -> Samples:
     """Equal intervals between near and far, dense."""
     edges = torch.linspace(near, far, num_samples + 1, dtype=dtype).expand(num_rays, -1)
     return Samples(edges[:, :-1], edges[:, 1:], num_rays)
@@ -106,7 +108,9 @@ def test_linear_density_has_exact_opacity(layout: str, dtype: torch.dtype, num_s
 def test_gaussian_blob_has_the_optical_depth_of_its_error_function(layout: str) -> None:
     near, far, center, width, peak = 2.0, 4.5, 3.0, 0.3, 4.0
     scale = width * math.sqrt(2)
-    depth = peak * width * math.sqrt(math.pi / 2) * (math.erf((far - center) / scale) - math.erf((near - center) / scale))
+    depth = (
+        peak * width * math.sqrt(math.pi / 2) * (math.erf((far - center) / scale) - math.erf((near - center) / scale))
+    )
     errors = []
     for count in (200, 400):
         samples = uniform(near, far, count)
@@ -156,9 +160,7 @@ def test_packed_rays_agree_with_a_loop(rays: list) -> None:
         densities += [density for _, density, _ in row]
         colors += [color for _, _, color in row]
         indices += [r] * len(row)
-        pixels.append(
-            composite_ray(edges[:-1], edges[1:], [d for _, d, _ in row], [c for _, _, c in row], background)
-        )
+        pixels.append(composite_ray(edges[:-1], edges[1:], [d for _, d, _ in row], [c for _, _, c in row], background))
     as_tensor = lambda values, *shape: torch.tensor(values, dtype=torch.float64).reshape(*shape)  # noqa: E731
     samples = Samples(
         as_tensor(starts, -1), as_tensor(ends, -1), len(rays), ray_indices=torch.tensor(indices, dtype=torch.int64)
@@ -420,9 +422,7 @@ def test_no_background_is_black(layout: str) -> None:
     black = render(layout, samples, density, rgb)
     lit = render(layout, samples, density, rgb, background)
     assert black.background is None
-    torch.testing.assert_close(
-        lit.rgb - black.rgb, (1 - black.opacity)[:, None] * background, rtol=0, atol=1e-15
-    )
+    torch.testing.assert_close(lit.rgb - black.rgb, (1 - black.opacity)[:, None] * background, rtol=0, atol=1e-15)
 
 
 @both_layouts

@@ -12,7 +12,7 @@ MAX_PIXELS = 2**25
 MAX_SIDE = 2**14
 FORMATS = ("PNG", "JPEG")
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
-BAND_PIXELS = 2**18
+BAND_PIXELS = 2**15
 
 Bytes = NDArray[np.uint8]
 
@@ -117,7 +117,7 @@ def straight_alpha(pixels: Bytes) -> Bytes:
 
 
 def _premultiplied(pixels: Bytes, dtype: type) -> NDArray:
-    wide = pixels.astype(dtype)
+    wide: NDArray = pixels.astype(dtype)
     if pixels.shape[-1] == 4:
         wide[..., :3] *= wide[..., 3:]
     return wide

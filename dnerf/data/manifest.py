@@ -168,17 +168,18 @@ def read_manifest(root: Path, split: str, max_frames: int) -> Manifest:
 
 def _read_json(path: Path) -> Any:
     try:
+        status = path.stat()
         # Opening a pipe would wait for ever.
-        if not stat.S_ISREG(path.stat().st_mode):
+        if not stat.S_ISREG(status.st_mode):
             raise OSError("not a regular file")
+        if status.st_size > MAX_BYTES:
+            raise ValueError(f"{path}: file must be at most {MAX_BYTES // 2**20} MiB, got {status.st_size} bytes")
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+            data = file.read(status.st_size)
     except FileNotFoundError:
         raise ValueError(f"{path}: file does not exist") from None
     except OSError as error:
         raise ValueError(f"{path}: file cannot be read: {error.strerror or error}") from error
-    if len(data) > MAX_BYTES:
-        raise ValueError(f"{path}: file must be at most {MAX_BYTES // 2**20} MiB")
     try:
         return json.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:

@@ -16,9 +16,7 @@ from dnerf.scenes import AnalyticScene
 DNERF_ANGLE_X = 0.6911112  # horizontal field of view of D-NeRF's cameras, in radians
 
 
-def random_views(
-    num_views: int, *, midway: bool = False, seed: int = 0, radius: float = 4.0
-) -> tuple[Tensor, Tensor]:
+def random_views(num_views: int, *, midway: bool = False, seed: int = 0, radius: float = 4.0) -> tuple[Tensor, Tensor]:
     """Cameras spread over the upper hemisphere and times spread over [0, 1].
 
     Args:
@@ -58,9 +56,7 @@ def render_exact(
     for i in range(0, len(rays), chunk):
         part = rays[i : i + chunk]
         samples = scene.exact_samples(part)
-        output = scene(
-            samples.positions(part), samples.per_sample(part.directions), samples.per_sample(part.times)
-        )
+        output = scene(samples.positions(part), samples.per_sample(part.directions), samples.per_sample(part.times))
         parts.append(composite(samples, output, background))
     return (
         torch.cat([p.rgb for p in parts]),

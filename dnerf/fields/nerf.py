@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from dnerf.checks import check_shape
 from dnerf.compositing import FieldOutput
 from dnerf.deformations.base import check_positions_times
 from dnerf.encodings import SinusoidalEncoding
@@ -72,5 +73,6 @@ class NeRFField(RadianceField):
         features = self.trunk(self.encode_positions(positions))
         density = self._density(features)
         if self.encode_directions is not None:
+            check_shape("directions", directions, positions.shape)
             features = torch.cat([self.features(features), self.encode_directions(directions)], dim=-1)
         return FieldOutput(density=density, rgb=torch.sigmoid(self.to_rgb(features).to(density.dtype)))

@@ -39,7 +39,7 @@ def packed_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
 def packed_weights_reference(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     """The definition of `packed_weights` in plain torch, on rays padded to the same number of samples."""
     if not len(optical_depth):
-        return torch.zeros_like(optical_depth)
+        return optical_depth.clone()
     counts = offsets.diff()
     rays = torch.repeat_interleave(counts)
     columns = torch.arange(len(optical_depth), device=offsets.device) - offsets[rays]

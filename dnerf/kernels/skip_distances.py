@@ -6,6 +6,7 @@ from torch.nn import functional
 
 from .backend import choose, run_compiled
 
+# numba's cache on disk does not notice a change of these: touch the files that import them.
 BLOCK_BITS = 3
 BLOCK = 1 << BLOCK_BITS
 MAX_DISTANCE = 255

@@ -25,7 +25,7 @@ class Sampler(nn.Module, ABC):
             generator: source of randomness in training mode.
         """
 
-    def update(self, field: RadianceField, step: int) -> None:  # noqa: B027 - a hook: most samplers learn nothing
+    def update(self, field: RadianceField, step: int) -> None:
         """Learn from the field between training steps; does nothing unless overridden.
 
         Args:
@@ -33,7 +33,7 @@ class Sampler(nn.Module, ABC):
             step: number of training steps done so far.
         """
 
-    def observe(self, rays: Rays, samples: Samples, output: FieldOutput) -> None:  # noqa: B027 - as above
+    def observe(self, rays: Rays, samples: Samples, output: FieldOutput) -> None:
         """Learn from what the field said at the samples of a training step; does nothing unless overridden.
 
         Args:

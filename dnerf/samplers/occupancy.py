@@ -9,7 +9,7 @@ from torch.nn.functional import max_pool3d
 from dnerf.checks import as_box, check_positive
 from dnerf.compositing import FieldOutput
 from dnerf.fields.base import RadianceField
-from dnerf.kernels import march
+from dnerf.kernels import march, skip_distances
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 
@@ -83,8 +83,10 @@ class OccupancySampler(Sampler):
         self.register_buffer("shape", torch.tensor([num_slabs, *cells]), persistent=False)
         self.register_buffer("maxima", torch.full((num_slabs, *cells), float(threshold)))
         self.register_buffer("occupied", torch.ones((num_slabs, *cells), dtype=torch.bool))
+        self.register_buffer("skips", skip_distances(self.occupied))
         self.box: Tensor
         self.shape: Tensor
+        self.skips: Tensor
         self.maxima: Tensor
         self.occupied: Tensor
 
@@ -105,6 +107,7 @@ class OccupancySampler(Sampler):
             occupancy=self.occupied,
             aabb=self.box,
             step=self.step_size,
+            skips=self.skips,
         )
         return Samples(
             marched.starts,
@@ -171,3 +174,4 @@ class OccupancySampler(Sampler):
         self.occupied.copy_(occupied)
         self.occupied[1:] |= occupied[:-1]
         self.occupied[:-1] |= occupied[1:]
+        self.skips.copy_(skip_distances(self.occupied))

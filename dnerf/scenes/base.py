@@ -14,7 +14,7 @@ from dnerf.scenes.bodies import Body
 from dnerf.scenes.poses import Pose
 from dnerf.scenes.quadrature import MAX_DEPTH, absorption_rule
 
-NUM_NODES = {torch.float32: 5, torch.float64: 10}
+NUM_NODES = {torch.float32: 6, torch.float64: 16}
 """Gauss nodes per interval of smooth colour: enough for the rounding of each precision in the scenes here."""
 
 

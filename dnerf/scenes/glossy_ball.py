@@ -23,5 +23,5 @@ def make_glossy_ball(density: float = 80.0) -> AnalyticScene:
     bodies = [Body(Ball(0.62), Glossy(Lit(Gradient(PLUM, CORAL))), bob, density)]
     for index, color in enumerate(BEADS):
         orbit = Orbit(0.98, 1.0, index / len(BEADS), 0.2)
-        bodies.append(Body(Ball(0.13), Glossy(Lit(Plain(color))), orbit, density))
+        bodies.append(Body(Ball(0.13), Glossy(Lit(Plain(color)), width=0.3), orbit, density))
     return AnalyticScene(bodies, box=((-1.2, -1.2, -0.85), (1.2, 1.2, 0.85)))

@@ -69,7 +69,7 @@ def _solve_rule(depth: Tensor, num_nodes: int) -> tuple[Tensor, Tensor]:
     Returns:
         nodes (M, n) and inner edges (M, n - 1).
     """
-    points, masses = gauss_legendre(160)
+    points, masses = _fejer_rule(192)
     mass = masses * torch.exp(-depth[:, None] * points)
     vector = (mass / mass.sum(-1, keepdim=True)).sqrt()
     basis, diagonal, off_diagonal = [vector], [], []
@@ -91,9 +91,9 @@ def _solve_rule(depth: Tensor, num_nodes: int) -> tuple[Tensor, Tensor]:
     return nodes, -torch.log(left) / depth[:, None]
 
 
-def gauss_legendre(num_nodes: int) -> tuple[Tensor, Tensor]:
-    """Gauss-Legendre nodes and weights on [0, 1], (n,) float64 each (Golub and Welsch 1969)."""
-    order = torch.arange(1, num_nodes, dtype=torch.float64)
-    beside = order / (4 * order * order - 1).sqrt()
-    nodes, vectors = torch.linalg.eigh(torch.diag(beside, 1) + torch.diag(beside, -1))
-    return 0.5 * (nodes + 1), vectors[0] ** 2
+def _fejer_rule(num_nodes: int) -> tuple[Tensor, Tensor]:
+    """Fejer's first rule on [0, 1]: nodes and positive weights, (n,) float64 each, in closed form (Fejer 1933)."""
+    angle = (torch.arange(num_nodes, dtype=torch.float64) + 0.5) * (math.pi / num_nodes)
+    orders = torch.arange(1, num_nodes // 2 + 1, dtype=torch.float64)
+    series = (torch.cos(2 * angle[:, None] * orders) / (4 * orders * orders - 1)).sum(-1)
+    return 0.5 + 0.5 * torch.cos(angle), (1 - 2 * series) / num_nodes

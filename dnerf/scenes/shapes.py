@@ -38,13 +38,13 @@ class Shape(ABC):
 
     @abstractmethod
     def normals(self, points: Tensor) -> Tensor:
-        """Outward normals of the surface, continued smoothly inside so that shading is smooth along rays.
+        """About the outward normals of the surface, continued inside as polynomials: shading is smooth along rays.
 
         Args:
             points: (..., 3) inside.
 
         Returns:
-            (..., 3), length at most 1, close to 1 at the surface.
+            (..., 3), length at most 1, near 1 on most of the surface.
         """
 
 
@@ -66,11 +66,6 @@ def _ball_crossing(origins: Tensor, directions: Tensor, radius: float) -> tuple[
     middle = torch.where(parallel, torch.zeros_like(middle), middle)
     hits = below > 0
     return torch.where(hits, middle - half, infinity), torch.where(hits, middle + half, -infinity)
-
-
-def _soften(normals: Tensor) -> Tensor:
-    """Scale vectors smoothly to length below 1: |q| / sqrt(0.1 + |q|^2), 0.95 at |q| = 1."""
-    return normals * (0.1 + (normals * normals).sum(-1, keepdim=True)).rsqrt()
 
 
 @dataclass(frozen=True)
@@ -127,8 +122,14 @@ class Box(Shape):
         return ray_box(origins, directions, torch.stack([-half, half]))
 
     def normals(self, points: Tensor) -> Tensor:
-        """Fifth powers of the relative coordinates: flat faces, rounded edges."""
-        return _soften((points / constant(self.half_sizes, points)) ** 5)
+        """Cubes of the relative coordinates q, less towards the edges: q_i^3 (1 - a sum_{j != i} q_j^4).
+
+        With a = 1 - sqrt(1/2) the length is 1 in the middle of a face and of an edge.
+        """
+        relative = points / constant(self.half_sizes, points)
+        fourth = relative**4
+        others = fourth.sum(-1, keepdim=True) - fourth
+        return relative**3 * (1 - (1 - math.sqrt(0.5)) * others)
 
 
 @dataclass(frozen=True)
@@ -189,8 +190,9 @@ class Capsule(Shape):
         )
 
     def normals(self, points: Tensor) -> Tensor:
-        """Away from the axis, bending to the axis towards the tips."""
+        """Away from the axis, bending to the axis towards the tips: a polynomial, the steeper the longer it is."""
         axis = constant(self.end, points) / self.length
         along, across = self._split(points)
-        tip = (along - 0.5 * self.length) / (0.5 * self.length + self.radius)
-        return _soften(across / self.radius + (tip**5)[..., None] * axis)
+        half = 0.5 * self.length
+        tip = ((along - half) / (half + self.radius)) ** (2 * math.ceil(half / self.radius) + 3)
+        return 0.99 * (across / self.radius + tip[..., None] * axis)

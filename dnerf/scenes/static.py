@@ -16,18 +16,14 @@ def make_static(density: float = 80.0) -> AnalyticScene:
     Args:
         density: of all bodies, in 1 / world unit.
     """
-    floor = -0.5
-    board = Checker(Plain(CREAM), Plain(SLATE), grid_planes(0.25, 3, "xy"))
-    shadows = ((0.38, -0.32, 0.36), (-0.42, -0.28, 0.42), (0.02, 0.48, 0.30))
+    floor = -0.42
+    board = Checker(Plain(CREAM), Plain(SLATE), grid_planes(0.21, 3, "xy"))
+    shadows = ((0.32, -0.27, 0.30), (-0.35, -0.24, 0.35), (0.02, 0.40, 0.25))
+    turned = (0.0, 0.0, math.radians(28))
     bodies = [
-        Body(Box((1.0, 1.0, 0.04)), Shadowed(Lit(board), shadows), Fixed((0.0, 0.0, floor - 0.04)), density),
-        Body(Ball(0.36), Lit(Plain(CORAL)), Fixed((0.38, -0.32, floor + 0.36)), density),
-        Body(
-            Box((0.28, 0.28, 0.28)),
-            Lit(Plain(TEAL)),
-            Fixed((-0.42, -0.28, floor + 0.28), (0.0, 0.0, math.radians(28))),
-            density,
-        ),
-        Body(Capsule(0.2, (0.0, 0.0, 0.55)), Lit(Plain(AMBER)), Fixed((0.02, 0.48, floor + 0.2)), density),
+        Body(Box((0.84, 0.84, 0.035)), Shadowed(Lit(board), shadows), Fixed((0.0, 0.0, floor - 0.035)), density),
+        Body(Ball(0.3), Lit(Plain(CORAL)), Fixed((0.32, -0.27, floor + 0.3)), density),
+        Body(Box((0.24, 0.24, 0.24)), Lit(Plain(TEAL)), Fixed((-0.35, -0.24, floor + 0.24), turned), density),
+        Body(Capsule(0.17, (0.0, 0.0, 0.46)), Lit(Plain(AMBER)), Fixed((0.02, 0.40, floor + 0.17)), density),
     ]
-    return AnalyticScene(bodies, box=((-1.05, -1.05, -0.6), (1.05, 1.05, 0.5)))
+    return AnalyticScene(bodies, box=((-0.9, -0.9, -0.5), (0.9, 0.9, 0.42)))

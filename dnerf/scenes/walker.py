@@ -70,10 +70,10 @@ def make_walker(cycles: int = 1, circle_radius: float = 0.0, density: float = 80
     for side, phase in ((1.0, 0.0), (-1.0, 0.5)):
         parts += _leg(hips, side, Gait(cycles, phase)) + _arm(lean, side, Gait(cycles, phase + 0.5))
     bodies = [Body(shape, Lit(texture, LIGHT), motion, density) for shape, texture, motion in parts]
-    board = Checker(Plain(CREAM), Plain(TEAL), grid_planes(0.2, 3, "xy"))
+    board = Checker(Plain(CREAM), Plain(TEAL), grid_planes(0.175, 3, "xy"))
     shadow = Shadowed(Lit(board), ((0.0, 0.0, 0.3 + circle_radius),), strength=0.45)
     bodies.append(Body(Box((0.7, 0.7, 0.03)), shadow, Fixed((0.0, 0.0, GROUND - 0.03)), density))
-    return AnalyticScene(bodies, box=((-0.9, -0.9, -0.95), (0.9, 0.9, 0.95)))
+    return AnalyticScene(bodies, box=((-0.9, -0.9, -0.95), (0.9, 0.9, 0.9)))
 
 
 Part = tuple[Shape, Texture, Motion]

@@ -163,9 +163,7 @@ def png(width: int, height: int, depth: int = 8, color_type: int = 6, data: byte
         (b"GIF89a\x04\x00\x03\x00\x00\x00\x00", "image must be a PNG or JPEG file"),
     ],
 )
-def test_what_is_no_sensible_image_is_refused_by_its_header(
-    tmp_path: Path, content: bytes, message: str
-) -> None:
+def test_what_is_no_sensible_image_is_refused_by_its_header(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=message) as caught:

@@ -102,7 +102,7 @@ def test_bad_fields_are_named_in_one_line(make_scene: Scene, edit: Edit, message
     ("content", "message"),
     [
         (b"", "malformed JSON at line 1 column 1"),
-        (b'{"frames": [\n  {"time": 0,}]}', "malformed JSON at line 2 column 13"),
+        (b'{"frames": [\n  wrong]}', "malformed JSON at line 2 column 3"),
         (b'{"frames": [{"time": 0', "malformed JSON at line 1 column 23"),
         (b"[1, 2]", r"must hold an object, got \[1, 2\]"),
         (b"null", "must hold an object, got None"),

@@ -15,9 +15,15 @@ def test_unknown_backend_is_named():
 
 
 def test_misspelt_environment_variable_is_named_on_first_use():
-    code = "import torch\nfrom dnerf import kernels\nkernels.packed_weights(torch.ones(1), torch.tensor([0, 1]))"
+    code = (
+        "import torch\nfrom dnerf import kernels\nkernels.packed_weights(torch.ones(1), torch.tensor([0, 1]))"
+    )
     result = subprocess.run(
-        [sys.executable, "-c", code], env={"DNERF_KERNELS": "nunba"}, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code],
+        env={"DNERF_KERNELS": "nunba"},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert "ValueError: kernel backend must be one of" in result.stderr
     assert "'nunba'" in result.stderr
@@ -25,9 +31,14 @@ def test_misspelt_environment_variable_is_named_on_first_use():
 
 def test_context_manager_restores_the_backend_after_an_error():
     before = kernels.get_backend()
-    with pytest.raises(RuntimeError), kernels.use_backend("reference"):
-        assert kernels.get_backend() == "reference"
-        raise RuntimeError
+
+    def fail():
+        with kernels.use_backend("reference"):
+            assert kernels.get_backend() == "reference"
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
     assert kernels.get_backend() == before
 
 

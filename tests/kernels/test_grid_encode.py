@@ -58,7 +58,9 @@ def test_levels_describe_the_table():
     assert LEVELS.num_rows == LEVELS.offsets[-1]
 
 
-@pytest.mark.parametrize(("resolutions", "max_rows"), [((), 8), ((0,), 8), (((2, 2),), 8), ((2,), 12), ((2,), 0)])
+@pytest.mark.parametrize(
+    ("resolutions", "max_rows"), [((), 8), ((0,), 8), (((2, 2),), 8), ((2,), 12), ((2,), 0)]
+)
 def test_impossible_levels_are_refused(resolutions, max_rows):
     with pytest.raises(ValueError, match="got"):
         GridLevels(resolutions, max_rows)
@@ -92,14 +94,12 @@ def test_linear_function_is_reproduced_with_its_slope(compiled):
 @settings(max_examples=12, deadline=None)
 @given(
     num_samples=st.integers(0, 40),
-    num_features=st.sampled_from([1, 2, 3, 4, 8, 16]),
+    num_features=st.sampled_from([1, 3, 8]),
     resolutions=st.lists(st.tuples(*[st.integers(1, 12)] * 3), min_size=1, max_size=3),
     log_rows=st.integers(3, 10),
     seed=st.integers(0, 9),
 )
-def test_numba_agrees_with_reference_on_random_grids(
-    num_samples, num_features, resolutions, log_rows, seed
-):
+def test_numba_agrees_with_reference_on_random_grids(num_samples, num_features, resolutions, log_rows, seed):
     levels = GridLevels(resolutions, 2**log_rows)
     positions, table = example(num_samples, levels, num_features, seed=seed)
     grad = torch.randn(num_samples, len(resolutions) * num_features, dtype=torch.float64)
@@ -124,11 +124,13 @@ def test_compiled_agrees_with_reference(compiled, dtype, num_samples):
 
 
 def test_gradcheck(compiled):
-    positions, table = (x.to(compiled).requires_grad_() for x in example(5, GridLevels((2, 4), 32), 2))
+    levels = GridLevels((1, 2), 8)
+    positions, table = example(2, levels, 1)
     # Away from the faces of cells, where the function has kinks.
-    positions = (positions.detach().clamp(0.03, 0.97) + 0.017).requires_grad_()
+    positions = (positions.clamp(0.03, 0.97) + 0.017).to(compiled).requires_grad_()
+    table = table.to(compiled).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda p, t: grid_encode(p, t, GridLevels((2, 4), 32)), (positions, table), nondet_tol=1e-12
+        lambda p, t: grid_encode(p, t, levels), (positions, table), nondet_tol=1e-12
     )
 
 
@@ -192,7 +194,10 @@ def test_table_gradient_split_into_row_blocks_is_the_same():
     positions, table = (x.numpy() for x in example(500))
     grad = torch.randn(500, 9, dtype=torch.float64).numpy()
     levels = cpu._levels(tuple(LEVELS.cells), LEVELS.max_rows)
-    whole, parts = torch.zeros(table.shape, dtype=torch.float64), torch.zeros(table.shape, dtype=torch.float64)
+    whole, parts = (
+        torch.zeros(table.shape, dtype=torch.float64),
+        torch.zeros(table.shape, dtype=torch.float64),
+    )
     cpu._grad_table(grad, positions, levels, 0, 2, whole.numpy(), (0,) * 3)
     cpu._grad_table(grad, positions, levels, 2, 5, parts.numpy(), (0,) * 3)
     assert torch.equal(whole, parts)
@@ -225,3 +230,14 @@ def test_reference_is_differentiable_twice(reference):
     assert torch.autograd.gradgradcheck(
         lambda p, t: grid_encode_reference(p, t, GridLevels((2,), 32)), (positions, table)
     )
+
+
+def test_second_derivative_of_a_compiled_kernel_is_refused():
+    positions, table = example(3)
+    positions.requires_grad_()
+    with kernels.use_backend("numba"):
+        (gradient,) = torch.autograd.grad(
+            (grid_encode(positions, table, LEVELS) ** 2).sum(), positions, create_graph=True
+        )
+        with pytest.raises(RuntimeError, match="no autograd formula"):
+            gradient.sum().backward()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..grid_encode import GridLevels
 from .launch import FAST, launch, num_threads
-from .rows import add_to_row, blend_rows, dot_row
+from .rows import add_to_row, blend_rows, dot_slopes
 
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
 # A table gradient's rows are dealt out in blocks of 2^6: fine enough to balance crowded regions of a dense level.
@@ -158,21 +158,7 @@ def _grad_positions(grad: Any, positions: Any, table: Any, levels: Any, out: Any
             z, w = _locate(positions[i, 2], level[2])
             rows = _rows(x, y, z, level)
             start = i * grad.shape[1] + j * len(lanes)
-            d0 = dot_row(table, rows[0], grad, start, lanes)
-            d1 = dot_row(table, rows[1], grad, start, lanes)
-            d2 = dot_row(table, rows[2], grad, start, lanes)
-            d3 = dot_row(table, rows[3], grad, start, lanes)
-            d4 = dot_row(table, rows[4], grad, start, lanes)
-            d5 = dot_row(table, rows[5], grad, start, lanes)
-            d6 = dot_row(table, rows[6], grad, start, lanes)
-            d7 = dot_row(table, rows[7], grad, start, lanes)
-            along_x = (one - w) * ((one - v) * (d1 - d0) + v * (d3 - d2)) + w * (
-                (one - v) * (d5 - d4) + v * (d7 - d6)
-            )
-            e0, e1 = d0 + u * (d1 - d0), d2 + u * (d3 - d2)
-            e2, e3 = d4 + u * (d5 - d4), d6 + u * (d7 - d6)
-            along_y = (one - w) * (e1 - e0) + w * (e3 - e2)
-            along_z = (one - v) * (e2 - e0) + v * (e3 - e1)
+            along_x, along_y, along_z = dot_slopes(table, rows, (u, v, w), grad, start, lanes)
             grad_x += along_x * positions.dtype.type(level[0])
             grad_y += along_y * positions.dtype.type(level[1])
             grad_z += along_z * positions.dtype.type(level[2])

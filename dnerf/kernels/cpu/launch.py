@@ -1,3 +1,4 @@
+# mypy: disable-error-code="attr-defined"
 """Starting numba kernels on as many threads as torch uses."""
 
 import os
@@ -9,12 +10,12 @@ from typing import Any
 
 import numba
 import torch
-from numba.core import config
 
 # OpenMP first: its pool gets along with torch's, where the other layers' threads fight torch's spinning workers
 # for the cores (measured: 6 ms lost per switch with workqueue), and it may be entered from several Python threads.
+# Where it is GNU OpenMP, as on Linux, kernels cannot run in a forked child: data loaders that need them must spawn.
 if "NUMBA_THREADING_LAYER" not in os.environ and "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-    config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+    numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
 
 # No assumption that values are finite: NaN and inf keep their meaning.
 FAST = {"contract", "nsz"}
@@ -22,7 +23,7 @@ FAST = {"contract", "nsz"}
 
 def num_threads() -> int:
     """Threads a kernel started now may use: torch's number, as far as numba has started so many."""
-    return min(torch.get_num_threads(), config.NUMBA_NUM_THREADS)
+    return min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
 
 
 def launch(kernel: Callable[..., Any], *arguments: Any) -> None:

@@ -29,7 +29,7 @@ def march(
     skips: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     o, d, t0, t1, times_, jitter_, box = (
-        x.contiguous().numpy() for x in (origins, directions, near, far, times, jitter, aabb)
+        x.detach().contiguous().numpy() for x in (origins, directions, near, far, times, jitter, aabb)
     )
     size = o.dtype.type(step)
     ranges = np.empty((len(o), 3), o.dtype)

@@ -3,6 +3,8 @@
 numba's loop over a row's few features neither unrolls nor vectorises well, since LLVM must assume that the arrays
 overlap. These intrinsics emit one vector operation per row; its width is the length of the tuple `lanes`, which
 makes it a compile-time constant.
+
+numba's cache on disk watches only the file that a kernel stands in: after a change here, touch those that import it.
 """
 
 from typing import Any
@@ -78,29 +80,54 @@ def add_to_row(
 
 
 @intrinsic
-def dot_row(typing: Any, table: Any, row: Any, values: Any, start: Any, lanes: Any) -> tuple[Any, Any]:
-    """sum_f table[row, f] * values.flat[start + f]."""
+def dot_slopes(
+    typing: Any, table: Any, rows: Any, fractions: Any, values: Any, start: Any, lanes: Any
+) -> tuple[Any, Any]:
+    """Derivatives to the three fractions of `sum_f values.flat[start + f] * blend[f]`.
+
+    `blend` is the trilinear interpolation of the 8 rows, bit 0 of whose number is x, bit 1 y and bit 2 z.
+    """
     width = lanes.count
+    scalar = table.dtype
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        table_, row_, values_, start_, _ = arguments
-        index = builder.mul(row_, ir.Constant(ir.IntType(64), width))
-        product = builder.fmul(
-            _load(context, builder, table, table_, index, width),
-            _load(context, builder, values, values_, start_, width),
-            flags=FLAGS,
-        )
-        scalar = product.type.element
-        suffix = f"v{width}f{table.dtype.bitwidth}"
-        reduce = cgutils.get_or_insert_function(
-            builder.module,
-            ir.FunctionType(scalar, [scalar, product.type]),
-            f"llvm.vector.reduce.fadd.{suffix}",
-        )
-        # Without reassoc the reduction would add lane after lane.
-        return builder.call(reduce, [ir.Constant(scalar, 0.0), product], fastmath=("reassoc", *FLAGS))
+        table_, rows_, fractions_, values_, start_, _ = arguments
 
-    return table.dtype(table, row, values, start, lanes), generate
+        def subtract(a: Any, b: Any) -> Any:
+            return builder.fsub(a, b, flags=FLAGS)
+
+        def blend(a: Any, b: Any, axis: int) -> Any:
+            return builder.fadd(a, builder.fmul(fraction[axis], subtract(b, a), flags=FLAGS), flags=FLAGS)
+
+        fraction = [_splat(builder, builder.extract_value(fractions_, a), width) for a in range(3)]
+        row = []
+        for k in range(8):
+            index = builder.mul(builder.extract_value(rows_, k), ir.Constant(ir.IntType(64), width))
+            row.append(_load(context, builder, table, table_, index, width))
+        across = [subtract(row[k + 1], row[k]) for k in (0, 2, 4, 6)]
+        along = [blend(row[k], row[k + 1], 0) for k in (0, 2, 4, 6)]
+        slopes = (
+            blend(blend(across[0], across[1], 1), blend(across[2], across[3], 1), 2),
+            blend(subtract(along[1], along[0]), subtract(along[3], along[2]), 2),
+            subtract(blend(along[2], along[3], 1), blend(along[0], along[1], 1)),
+        )
+        gradient = _load(context, builder, values, values_, start_, width)
+        sums = [_sum(builder, builder.fmul(slope, gradient, flags=FLAGS)) for slope in slopes]
+        return context.make_tuple(builder, signature.return_type, sums)
+
+    return types.UniTuple(scalar, 3)(table, rows, fractions, values, start, lanes), generate
+
+
+def _sum(builder: Any, vector: Any) -> Any:
+    scalar = vector.type.element
+    bits = 32 if isinstance(scalar, ir.FloatType) else 64
+    reduce = cgutils.get_or_insert_function(
+        builder.module,
+        ir.FunctionType(scalar, [scalar, vector.type]),
+        f"llvm.vector.reduce.fadd.v{vector.type.count}f{bits}",
+    )
+    # Without reassoc the reduction would add lane after lane.
+    return builder.call(reduce, [ir.Constant(scalar, 0.0), vector], fastmath=("reassoc", *FLAGS))
 
 
 @intrinsic

@@ -14,7 +14,7 @@ def weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     out = torch.empty_like(optical_depth, memory_format=torch.contiguous_format)
     if len(offsets) > 1 and len(optical_depth):
         _weights[(len(offsets) - 1,)](
-            optical_depth.contiguous(), offsets, out, _terms(optical_depth), BLOCK, num_warps=2
+            optical_depth.contiguous(), offsets.contiguous(), out, _terms(optical_depth), BLOCK, num_warps=2
         )
     return out
 
@@ -23,7 +23,13 @@ def grad_optical_depth(grad: Tensor, optical_depth: Tensor, weights: Tensor, off
     out = torch.empty_like(optical_depth, memory_format=torch.contiguous_format)
     if len(offsets) > 1 and len(optical_depth):
         _grad_optical_depth[(len(offsets) - 1,)](
-            grad.contiguous(), optical_depth.contiguous(), weights, offsets, out, BLOCK, num_warps=2
+            grad.contiguous(),
+            optical_depth.contiguous(),
+            weights,
+            offsets.contiguous(),
+            out,
+            BLOCK,
+            num_warps=2,
         )
     return out
 
@@ -36,7 +42,7 @@ def sums(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tensor:
         _sums[num_rays, triton.cdiv(num_columns, width)](
             values.contiguous(),
             values if weights is None else weights.contiguous(),
-            offsets,
+            offsets.contiguous(),
             out,
             num_columns,
             weights is not None,

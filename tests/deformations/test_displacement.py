@@ -1,0 +1,63 @@
+"""The D-NeRF deformation: a displacement that vanishes at the canonical time."""
+
+import math
+
+import pytest
+import torch
+
+from dnerf.deformations import DisplacementDeformation
+
+
+def trained(**arguments: object) -> DisplacementDeformation:
+    deformation = DisplacementDeformation(3, 16, (1,), **arguments)  # type: ignore[arg-type]
+    for parameter in deformation.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    return deformation
+
+
+@pytest.mark.parametrize("canonical_time", [0.0, 0.5, 1.0])
+def test_canonical_time_is_the_identity_after_any_training(canonical_time: float) -> None:
+    deformation = trained(canonical_time=canonical_time)
+    positions = torch.randn(20, 3)
+    assert torch.equal(deformation(positions, torch.full((20,), canonical_time)), positions)
+    assert not torch.equal(deformation(positions, torch.full((20,), 0.25)), positions)
+
+
+def test_displacement_is_continuous_at_the_canonical_time() -> None:
+    positions = torch.randn(20, 3)
+    canonical = trained()(positions, torch.full((20,), 1e-6))
+    torch.testing.assert_close(canonical, positions, rtol=0, atol=1e-4)
+
+
+def test_displacement_is_the_network_times_the_elapsed_time() -> None:
+    deformation = trained(canonical_time=0.25)
+    positions, times = torch.randn(20, 3), torch.rand(20)
+    free = trained(canonical_time=None)
+    free.load_state_dict(deformation.state_dict())
+    offsets = free(positions, times) - positions
+    expected = positions + (times - 0.25)[:, None] * offsets
+    torch.testing.assert_close(deformation(positions, times), expected, rtol=0, atol=1e-5)
+
+
+def test_without_canonical_time_nothing_is_pinned() -> None:
+    positions = torch.randn(20, 3)
+    assert not torch.equal(trained(canonical_time=None)(positions, torch.zeros(20)), positions)
+
+
+def test_shut_window_hides_the_fine_octaves() -> None:
+    deformation = trained(window_end=1.0)
+    positions, times = torch.randn(20, 3), torch.rand(20)
+    shift = 2 * math.pi * torch.tensor([1.0, -1.0, 2.0])
+    offsets = deformation(positions, times) - positions
+    moved = deformation(positions + shift, times) - positions - shift
+    # Without octaves the network is piecewise linear in the position, not periodic.
+    assert not torch.allclose(offsets, moved, atol=1e-3)
+    assert torch.count_nonzero(deformation.encode_positions(positions)[:, 3:]) == 0
+    deformation.encode_positions.set_progress(1.0)
+    assert not torch.allclose(deformation(positions, times) - positions, offsets, atol=1e-3)
+
+
+@pytest.mark.parametrize("canonical_time", [-0.1, 1.1, math.nan])
+def test_canonical_time_outside_the_film_is_refused(canonical_time: float) -> None:
+    with pytest.raises(ValueError, match=r"canonical_time must be in \[0, 1\] or None"):
+        DisplacementDeformation(2, 8, (), canonical_time=canonical_time)

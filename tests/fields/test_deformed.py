@@ -1,0 +1,45 @@
+"""A canonical field seen through a deformation."""
+
+import torch
+from reference import FormulaField
+from torch import Tensor
+
+from dnerf.compositing import FieldOutput
+from dnerf.deformations import Deformation
+from dnerf.fields import DeformedField, RadianceField
+
+
+class Drift(Deformation):
+    """The world moves along x by the time: canonical = world - time."""
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        return positions - times[..., None] * positions.new_tensor([1.0, 0.0, 0.0])
+
+
+class Gray(RadianceField):
+    """Says more than density and colour."""
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        return torch.ones_like(times)
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        return FieldOutput(self.density(positions, times), torch.full_like(positions, 0.5), {"times": times})
+
+
+def test_field_is_asked_at_canonical_positions_and_the_same_times_and_directions() -> None:
+    canonical = FormulaField(lambda x: x.square().sum(-1), lambda x, d, t: torch.stack([x[..., 0], d[..., 1], t], -1))
+    field = DeformedField(Drift(), canonical)
+    positions, directions, times = torch.randn(8, 3), torch.randn(8, 3), torch.rand(8)
+    moved = positions - times[:, None] * torch.tensor([1.0, 0, 0])
+    output = field(positions, directions, times)
+    torch.testing.assert_close(output.density, moved.square().sum(-1))
+    torch.testing.assert_close(output.rgb, torch.stack([moved[:, 0], directions[:, 1], times], -1))
+    torch.testing.assert_close(field.density(positions, times), output.density)
+
+
+def test_canonical_positions_come_with_the_output_and_extras_are_kept() -> None:
+    positions, times = torch.randn(8, 3), torch.rand(8)
+    extras = DeformedField(Drift(), Gray())(positions, positions, times).extras
+    assert extras.keys() == {"times", "canonical_positions"}
+    assert torch.equal(extras["times"], times)
+    assert torch.equal(extras["canonical_positions"], Drift()(positions, times))

@@ -1,0 +1,194 @@
+"""What every sampler must do. A new one is one line in `SAMPLERS`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from reference import fog, rays_towards_origin, soft_ball
+
+from dnerf.compositing import composite
+from dnerf.rays import Rays, Samples
+from dnerf.samplers import ImportanceSampler, OccupancySampler, Sampler, StratifiedSampler
+
+BOX = torch.tensor([[-1.0, -1.2, -0.8], [0.9, 1.1, 1.3]])
+
+
+def filled_occupancy() -> Sampler:
+    sampler = OccupancySampler(BOX.tolist(), 0.05, 16, num_slabs=2)
+    sampler.fill(soft_ball())
+    return sampler
+
+
+SAMPLERS: dict[str, Callable[[], Sampler]] = {
+    "stratified": lambda: StratifiedSampler(16),
+    "stratified, one sample": lambda: StratifiedSampler(1),
+    "stratified in a box": lambda: StratifiedSampler(16, BOX),
+    "importance, shared network": lambda: ImportanceSampler(8, 12),
+    "importance, own proposal": lambda: ImportanceSampler(8, 12, soft_ball(width=0.6)),
+    "occupancy, all occupied": lambda: OccupancySampler(BOX.tolist(), 0.1, 8, num_slabs=4),
+    "occupancy, filled in a box": filled_occupancy,
+    "importance in a box": lambda: ImportanceSampler(8, 12, box=BOX),
+}
+
+every_sampler = pytest.mark.parametrize("name", SAMPLERS)
+both_modes = pytest.mark.parametrize("training", [False, True])
+
+
+@dataclass(frozen=True)
+class Interval:
+    """One sample of one ray."""
+
+    start: float
+    end: float
+    point: float
+
+
+def intervals(samples: Samples) -> list[list[Interval]]:
+    """Each ray's samples in order, whatever the layout."""
+    rays: list[list[Interval]] = [[] for _ in range(samples.num_rays)]
+    table = samples if samples.is_packed else samples.packed()
+    assert table.ray_indices is not None
+    columns = (table.ray_indices, table.starts, table.ends, table.distances)
+    for r, *numbers in zip(*(column.tolist() for column in columns)):
+        rays[r].append(Interval(*numbers))
+    return rays
+
+
+def sample(name: str, rays: Rays, training: bool = False, seed: int = 0) -> Samples:
+    """Samples of a soft ball's rays; a fresh sampler each time, so that nothing is carried over."""
+    sampler = SAMPLERS[name]().train(training)
+    return sampler(rays, soft_ball(), generator=torch.Generator().manual_seed(seed))
+
+
+@every_sampler
+@both_modes
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_intervals_are_ordered_and_lie_within_the_ray(name: str, training: bool, dtype: torch.dtype) -> None:
+    rays = rays_towards_origin(50, dtype)
+    samples = sample(name, rays, training)
+    assert samples.num_rays == 50
+    assert samples.starts.dtype == dtype
+    for row, near, far in zip(intervals(samples), rays.near.tolist(), rays.far.tolist(), strict=True):
+        ends = [near]
+        for interval in row:
+            assert ends[-1] <= interval.start <= interval.point <= interval.end <= far
+            ends.append(interval.end)
+
+
+@every_sampler
+@both_modes
+@pytest.mark.parametrize("length", [1e-7, 1e-5, 1e-3, 1e3])
+def test_no_interval_is_negative_on_very_short_and_long_rays(name: str, training: bool, length: float) -> None:
+    rays = rays_towards_origin(50)
+    rays = Rays(rays.origins, rays.directions, rays.times, 2 + rays.times, 2 + rays.times + length)
+    samples = sample(name, rays, training)
+    assert (samples.lengths >= 0).all()
+    assert (samples.distances >= samples.starts).all()
+    assert (samples.distances <= samples.ends).all()
+
+
+@every_sampler
+def test_ray_indices_are_sorted(name: str) -> None:
+    samples = sample(name, rays_towards_origin(50))
+    if samples.ray_indices is not None:
+        assert samples.ray_indices.dtype == torch.int64
+        assert (samples.ray_indices.diff() >= 0).all()
+
+
+@every_sampler
+@both_modes
+@pytest.mark.parametrize("length", [0.0, -1.0])
+def test_empty_ray_shows_background(name: str, training: bool, length: float) -> None:
+    rays = rays_towards_origin(6)
+    rays = Rays(rays.origins, rays.directions, rays.times, rays.near, rays.near + length)
+    samples = sample(name, rays, training)
+    output = fog(1e6)(samples.positions(rays), samples.per_sample(rays.directions), samples.per_sample(rays.times))
+    background = torch.rand(6, 3)
+    rendering = composite(samples, output, background)
+    assert torch.equal(rendering.rgb, background)
+    assert torch.equal(rendering.opacity, torch.zeros(6))
+
+
+@every_sampler
+@both_modes
+def test_no_rays_give_no_samples(name: str, training: bool) -> None:
+    samples = sample(name, rays_towards_origin(6)[:0], training)
+    assert samples.num_rays == 0
+    assert samples.starts.numel() == 0
+
+
+@every_sampler
+def test_evaluation_is_deterministic(name: str) -> None:
+    rays = rays_towards_origin(30)
+    assert intervals(sample(name, rays, seed=0)) == intervals(sample(name, rays, seed=1))
+
+
+@every_sampler
+def test_evaluation_leaves_the_random_numbers_alone(name: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    before = generator.get_state()
+    SAMPLERS[name]().eval()(rays_towards_origin(5), soft_ball(), generator=generator)
+    assert torch.equal(generator.get_state(), before)
+
+
+@every_sampler
+def test_training_follows_its_generator(name: str) -> None:
+    rays = rays_towards_origin(30)
+    first, again, other = (intervals(sample(name, rays, training=True, seed=seed)) for seed in (1, 1, 2))
+    assert first == again
+    assert first != other
+
+
+@every_sampler
+def test_training_uses_no_randomness_but_its_generator(name: str) -> None:
+    before = torch.random.get_rng_state()
+    sample(name, rays_towards_origin(5), training=True)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+@every_sampler
+def test_rays_do_not_see_each_other(name: str) -> None:
+    rays = rays_towards_origin(12, torch.float64)
+    together = intervals(sample(name, rays))
+    backward = intervals(sample(name, rays[torch.arange(11, -1, -1)]))
+    for r in range(12):
+        alone = intervals(sample(name, rays[r : r + 1]))[0]
+        for row in (together[r], backward[11 - r]):
+            assert len(row) == len(alone)
+            for a, b in zip(row, alone):
+                assert (a.start, a.end, a.point) == pytest.approx((b.start, b.end, b.point), rel=1e-12)
+
+
+@every_sampler
+@both_modes
+def test_no_gradient_flows_to_where_samples_lie(name: str, training: bool) -> None:
+    samples = sample(name, rays_towards_origin(5), training)
+    assert not samples.starts.requires_grad
+    assert not samples.ends.requires_grad
+    assert not samples.distances.requires_grad
+
+
+@pytest.mark.parametrize("name", [name for name in SAMPLERS if "box" in name])
+@both_modes
+def test_samples_stay_in_the_box_and_cover_it(name: str, training: bool) -> None:
+    rays = rays_towards_origin(200, torch.float64)
+    samples = sample(name, rays, training)
+    box = BOX.double()
+    for row, origin, direction in zip(intervals(samples), rays.origins, rays.directions):
+        row = [interval for interval in row if interval.end > interval.start]
+        distances = torch.linspace(1, 5, 2001, dtype=torch.float64)
+        points = origin + distances[:, None] * direction
+        inside = ((points >= box[0]) & (points <= box[1])).all(-1)
+        assert bool(inside.any()) or not row
+        if row and inside.any():
+            # To the spacing of the brute-force points, 0.002.
+            assert row[0].start == pytest.approx(distances[inside][0].item(), abs=0.0021)
+            assert row[-1].end == pytest.approx(distances[inside][-1].item(), abs=0.0021)
+
+
+@every_sampler
+def test_update_may_be_called_at_any_step(name: str) -> None:
+    sampler = SAMPLERS[name]()
+    sampler.update(soft_ball(), 0)
+    sampler.update(soft_ball(), 1000)

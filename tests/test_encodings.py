@@ -1,0 +1,135 @@
+"""Encodings against loops and against quadrature on the sphere."""
+
+import math
+
+import pytest
+import torch
+from reference import sinusoidal, sphere_quadrature
+
+from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
+
+
+@pytest.mark.parametrize("num_dims", [1, 3])
+@pytest.mark.parametrize(
+    ("num_frequencies", "include_input"), [(0, True), (1, True), (10, True), (1, False), (10, False)]
+)
+def test_sinusoidal_encoding_agrees_with_a_loop(num_dims: int, num_frequencies: int, include_input: bool) -> None:
+    encoding = SinusoidalEncoding(num_dims, num_frequencies, include_input)
+    values = 2 * torch.randn(20, num_dims, dtype=torch.float64)
+    encoded = encoding(values)
+    expected = [sinusoidal(row, num_frequencies, include_input, [1.0] * num_frequencies) for row in values.tolist()]
+    assert encoded.dtype == torch.float64
+    assert encoded.shape == (20, encoding.out_features)
+    torch.testing.assert_close(encoded, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.1, 0.25, 0.37, 0.5, 0.9, 1.0, 1.5])
+def test_window_opens_octave_by_octave(progress: float) -> None:
+    encoding = SinusoidalEncoding(2, 4, window_end=0.5)
+    encoding.set_progress(progress)
+    alpha = 4 * min(progress / 0.5, 1)
+    window = [(1 - math.cos(math.pi * min(max(alpha - k, 0), 1))) / 2 for k in range(4)]
+    values = torch.randn(5, 2, dtype=torch.float64)
+    expected = torch.tensor([sinusoidal(row, 4, True, window) for row in values.tolist()], dtype=torch.float64)
+    # The window is kept in float32.
+    torch.testing.assert_close(encoding(values), expected, rtol=0, atol=1e-6)
+
+
+def test_window_is_shut_at_first_and_fully_open_at_its_end() -> None:
+    encoding = SinusoidalEncoding(3, 6, window_end=0.8)
+    values = torch.randn(7, 3)
+    assert torch.count_nonzero(encoding(values)[:, 3:]) == 0
+    encoding.set_progress(0.8)
+    torch.testing.assert_close(encoding(values), SinusoidalEncoding(3, 6)(values), rtol=0, atol=1e-6)
+
+
+def test_window_is_saved_with_the_model() -> None:
+    trained = SinusoidalEncoding(3, 6, window_end=0.8)
+    trained.set_progress(0.3)
+    loaded = SinusoidalEncoding(3, 6, window_end=0.8)
+    loaded.load_state_dict(trained.state_dict())
+    values = torch.randn(7, 3)
+    assert torch.equal(loaded(values), trained(values))
+
+
+def test_progress_changes_nothing_without_a_window() -> None:
+    encoding, values = SinusoidalEncoding(3, 6), torch.randn(7, 3)
+    before = encoding(values)
+    encoding.set_progress(0.0)
+    assert torch.equal(encoding(values), before)
+    assert encoding.state_dict() == {}
+
+
+def test_sinusoidal_encoding_of_an_empty_batch_is_empty() -> None:
+    assert SinusoidalEncoding(3, 4)(torch.empty(2, 0, 3)).shape == (2, 0, 27)
+
+
+def test_gradcheck_of_sinusoidal_encoding() -> None:
+    encoding = SinusoidalEncoding(3, 3, window_end=1.0)
+    encoding.set_progress(0.7)
+    assert torch.autograd.gradcheck(encoding, (torch.randn(2, 3, dtype=torch.float64, requires_grad=True),))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_dims": 0, "num_frequencies": 4}, "num_dims must be > 0"),
+        ({"num_dims": 3, "num_frequencies": -1}, "num_frequencies must be >= 0"),
+        ({"num_dims": 3, "num_frequencies": 0, "include_input": False}, "num_frequencies must be > 0"),
+        ({"num_dims": 3, "num_frequencies": 4, "window_end": 0.0}, "window_end must be in"),
+        ({"num_dims": 3, "num_frequencies": 4, "window_end": 1.1}, "window_end must be in"),
+        ({"num_dims": 3, "num_frequencies": 4, "window_end": math.nan}, "window_end must be in"),
+    ],
+)
+def test_sinusoidal_encoding_refuses_bad_arguments(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SinusoidalEncoding(**arguments)
+
+
+def test_values_of_another_size_are_named() -> None:
+    with pytest.raises(ValueError, match=r"values must have shape \(..., 1\), got \(5, 2\)"):
+        SinusoidalEncoding(1, 4)(torch.zeros(5, 2))
+    with pytest.raises(ValueError, match=r"directions must have shape \(..., 3\), got \(5, 2\)"):
+        SphericalHarmonicsEncoding()(torch.zeros(5, 2))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spherical_harmonics_are_orthonormal(degree: int) -> None:
+    # Products have degree 6 at most: four Gauss points in z and seven angles integrate them exactly.
+    points, weights = sphere_quadrature(4, 7)
+    values = SphericalHarmonicsEncoding(degree)(points)
+    assert values.shape[-1] == (degree + 1) ** 2
+    gram = values.T @ (weights[:, None] * values)
+    torch.testing.assert_close(gram, torch.eye((degree + 1) ** 2, dtype=torch.float64), rtol=0, atol=1e-13)
+
+
+def test_spherical_harmonics_have_the_eigenvalues_of_their_degree() -> None:
+    """On the unit sphere the Laplacian multiplies degree l by -l (l + 1); here by central differences of rotations."""
+    points, _ = sphere_quadrature(4, 7)
+    encoding, step = SphericalHarmonicsEncoding(3), 1e-3
+    laplacian = torch.zeros(len(points), 16, dtype=torch.float64)
+    for axis in range(3):
+        angle = torch.zeros(3, 3, dtype=torch.float64)
+        angle[(axis + 1) % 3, (axis + 2) % 3] = step
+        turn = torch.linalg.matrix_exp(angle - angle.T)
+        laplacian += encoding(points @ turn) + encoding(points @ turn.T) - 2 * encoding(points)
+    eigenvalues = torch.tensor([-float(l * (l + 1)) for l in range(4) for _ in range(2 * l + 1)])  # noqa: E741
+    # Second differences: an error of step^2 l^4 / 12 beside rounding of 1e-16 / step^2.
+    torch.testing.assert_close(laplacian / step**2, eigenvalues * encoding(points), rtol=0, atol=1e-4)
+
+
+def test_spherical_harmonics_have_the_graphics_signs() -> None:
+    encode = SphericalHarmonicsEncoding(3)
+    x, y, z = encode(torch.eye(3, dtype=torch.float64))
+    first = math.sqrt(3 / (4 * math.pi))
+    assert y[1].item() == pytest.approx(-first)
+    assert z[2].item() == pytest.approx(first)
+    assert x[3].item() == pytest.approx(-first)
+    assert z[6].item() == pytest.approx(math.sqrt(5 / (4 * math.pi)))
+    assert z[12].item() == pytest.approx(math.sqrt(7 / (4 * math.pi)))
+    assert x[15].item() < 0 < x[8].item()
+
+
+def test_spherical_harmonics_refuse_another_degree() -> None:
+    with pytest.raises(ValueError, match="degree must be one of 0, 1, 2, 3; got 4"):
+        SphericalHarmonicsEncoding(4)

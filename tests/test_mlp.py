@@ -1,0 +1,77 @@
+"""The MLP against a loop over its layers, and its start."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.mlp import MLP
+
+
+def forward_by_loop(mlp: MLP, inputs: Tensor, skips: tuple[int, ...]) -> Tensor:
+    """Evaluate one row after the other, one neuron after the other."""
+    rows = []
+    for row in inputs:
+        x = row
+        for i, layer in enumerate(mlp.hidden):
+            if i in skips:
+                x = torch.cat([x, row])
+            x = torch.stack([(w * x).sum() + b for w, b in zip(layer.weight, layer.bias)]).clamp(min=0)
+        if mlp.output is not None:
+            x = torch.stack([(w * x).sum() + b for w, b in zip(mlp.output.weight, mlp.output.bias)])
+        rows.append(x)
+    return torch.stack(rows)
+
+
+@pytest.mark.parametrize("skips", [(), (1,), (1, 3)])
+@pytest.mark.parametrize("out_features", [None, 2])
+def test_network_agrees_with_a_loop(skips: tuple[int, ...], out_features: int | None) -> None:
+    mlp = MLP(3, 5, 4, out_features=out_features, skips=skips).double()
+    for parameter in mlp.parameters():
+        torch.nn.init.normal_(parameter)
+    inputs = torch.randn(6, 3, dtype=torch.float64)
+    torch.testing.assert_close(mlp(inputs), forward_by_loop(mlp, inputs, skips), rtol=1e-12, atol=1e-12)
+    assert mlp(inputs).shape[-1] == mlp.out_features
+
+
+def test_skip_feeds_the_input_into_the_named_layer() -> None:
+    mlp = MLP(3, 5, 4, skips=(2,))
+    assert [layer.in_features for layer in mlp.hidden] == [3, 5, 8, 5]
+
+
+def test_no_hidden_layers_is_one_linear_map() -> None:
+    mlp = MLP(3, 5, 0, out_features=2)
+    a, b = torch.randn(2, 4, 3)
+    torch.testing.assert_close(mlp(a) + mlp(b) - mlp(torch.zeros(4, 3)), mlp(a + b))
+    assert MLP(3, 5, 0).out_features == 3
+
+
+def test_zero_output_is_zero_and_learns() -> None:
+    mlp = MLP(3, 16, 2, out_features=3, zero_output=True)
+    out = mlp(torch.randn(10, 3))
+    assert torch.count_nonzero(out) == 0
+    out.sum().backward()
+    assert torch.count_nonzero(mlp.output.weight.grad) > 0  # type: ignore[union-attr]
+
+
+def test_hidden_activations_keep_their_scale_at_the_start() -> None:
+    out = MLP(64, 256, 8)(torch.randn(1000, 64))
+    # He initialisation keeps the mean square of a ReLU network; eight random layers wander by less than 2.
+    assert 0.5 < out.square().mean().item() < 2
+
+
+def test_any_batch_shape_passes() -> None:
+    mlp = MLP(3, 4, 2, out_features=1, skips=(1,))
+    assert mlp(torch.zeros(2, 0, 3)).shape == (2, 0, 1)
+    assert mlp(torch.zeros(3)).shape == (1,)
+
+
+@pytest.mark.parametrize("skips", [(0,), (4,), (-1,), (2, 9)])
+def test_skips_that_name_no_layer_are_refused(skips: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"skips must lie in 1\.\.3"):
+        MLP(3, 5, 4, skips=skips)
+
+
+@pytest.mark.parametrize(("sizes", "name"), [((0, 5, 4), "in_features"), ((3, 0, 4), "hidden_"), ((3, 5, -1), "num_")])
+def test_sizes_that_are_not_positive_are_refused(sizes: tuple[int, int, int], name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        MLP(*sizes)

@@ -1,0 +1,137 @@
+import math
+import time
+
+import pytest
+import torch
+
+from dnerf.backgrounds import ConstantBackground, RandomBackground
+from dnerf.data import SyntheticData
+from dnerf.deformations import DisplacementDeformation
+from dnerf.fields import DeformedField, NeRFField
+from dnerf.losses import OpacityEntropyLoss, PhotometricLoss
+from dnerf.renderer import Renderer
+from dnerf.samplers import StratifiedSampler
+from dnerf.scenes import make_scene
+from dnerf.training import Trainer
+
+BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return SyntheticData(make_scene("static"), 24, num_train=8).frames("train")
+
+
+def small_renderer(background=None, density_shift=-1.0):
+    torch.manual_seed(0)
+    field = DeformedField(
+        DisplacementDeformation(2, 32, (), position_frequencies=4, time_frequencies=2),
+        NeRFField(2, 32, (), position_frequencies=4, density_shift=density_shift),
+    )
+    return Renderer(field, StratifiedSampler(24, BOX), RandomBackground() if background is None else background)
+
+
+def trainer(**changes):
+    return Trainer(**{"num_steps": 20, "num_rays": 64, "progress_bar": False, "log_every": 5, **changes})
+
+
+def weights(renderer):
+    return torch.cat([p.detach().flatten() for p in renderer.parameters()])
+
+
+def test_loss_falls(frames):
+    renderer = small_renderer()
+    records = []
+    trainer(num_steps=150, num_rays=256, learning_rates={"": 5e-3}).fit(
+        renderer, frames, callbacks=[lambda record, _: records.append(record)]
+    )
+    first, last = records[0].losses["loss"], sum(r.losses["loss"] for r in records[-5:]) / 5
+    assert last < 0.6 * first
+
+
+def test_same_seed_gives_the_same_weights(frames):
+    one, two, other = small_renderer(), small_renderer(), small_renderer()
+    trainer().fit(one, frames, seed=3)
+    trainer().fit(two, frames, seed=3)
+    trainer().fit(other, frames, seed=4)
+    assert torch.equal(weights(one), weights(two))
+    assert not torch.equal(weights(one), weights(other))
+
+
+def test_time_limit_ends_training_and_its_schedule(frames):
+    renderer = small_renderer()
+    record = trainer(num_steps=10**9, max_seconds=0.5, log_every=1).fit(renderer, frames)
+    assert 0.5 <= record.seconds < 5
+    # The last step was taken just before the limit, so its factor is near the schedule's end, 0.1.
+    assert record.learning_rate_factor < 0.3
+
+
+def test_records_come_every_log_every_steps_and_at_the_end(frames):
+    steps = []
+    trainer(num_steps=13, log_every=5).fit(small_renderer(), frames, callbacks=[lambda r, _: steps.append(r.step)])
+    assert steps == [1, 5, 10, 13]
+
+
+def test_callbacks_do_not_count_as_training_time(frames):
+    record = trainer(num_steps=4, log_every=1).fit(small_renderer(), frames, callbacks=[lambda *_: time.sleep(0.5)])
+    assert record.seconds < 1.5  # 2 s asleep
+
+
+@pytest.mark.parametrize(("schedule", "factor"), [("exponential", 0.01**0.5), ("cosine", 0.505), ("constant", 1.0)])
+def test_schedule_halfway(schedule, factor):
+    made = trainer(schedule=schedule, final_learning_rate=0.01)
+    assert math.isclose(made._learning_rate_factor(0.5, 1000), factor, rel_tol=1e-12)
+
+
+def test_warmup_rises_from_near_zero():
+    made = trainer(warmup_steps=9, schedule="constant")
+    assert [round(made._learning_rate_factor(0, step), 9) for step in (0, 4, 9, 20)] == [0.1, 0.5, 1.0, 1.0]
+
+
+def test_longest_prefix_gives_the_learning_rate():
+    renderer = small_renderer()
+    optimizer = trainer(learning_rates={"": 1.0, "field": 2.0, "field.deformation": 3.0})._optimizer(renderer)
+    rates = {id(p): group["lr"] for group in optimizer.param_groups for p in group["params"]}
+    for name, parameter in renderer.named_parameters():
+        assert rates[id(parameter)] == (3.0 if name.startswith("field.deformation") else 2.0)
+
+
+def test_rays_adapt_to_the_wanted_number_of_samples():
+    made = trainer(target_samples=1000, max_rays=300)
+    assert made._next_num_rays(100, 2000) == 50
+    assert made._next_num_rays(100, 800) == 125
+    assert made._next_num_rays(100, 10) == 200  # at most doubled
+    assert made._next_num_rays(200, 10) == 300  # bounded
+    assert made._next_num_rays(100, 10**9) == 50  # at most halved
+    assert trainer()._next_num_rays(100, 10) == 100
+
+
+def test_broken_loss_is_reported_with_step_and_parameters(frames):
+    renderer = small_renderer()
+    with torch.no_grad():
+        renderer.field.canonical.to_density.bias.fill_(math.nan)
+    with pytest.raises(FloatingPointError, match=r"step 1: .*loss.*field\.canonical\.to_density\.bias"):
+        trainer().fit(renderer, frames)
+
+
+def test_random_background_needs_alpha():
+    opaque = SyntheticData(make_scene("static"), 8, num_train=1, background="white").frames("train")
+    with pytest.raises(ValueError, match="background: a random one needs frames with alpha"):
+        trainer().fit(small_renderer(), opaque)
+    trainer(num_steps=1).fit(small_renderer(ConstantBackground("white")), opaque)
+
+
+@pytest.mark.parametrize("name", ["num_steps", "num_rays", "max_seconds", "target_samples", "log_every"])
+def test_numbers_must_be_positive(name):
+    with pytest.raises(ValueError, match=f"{name} must be > 0"):
+        trainer(**{name: 0})
+
+
+def test_losses_add_up_and_are_logged_by_name(frames):
+    records = []
+    losses = {"rgb": PhotometricLoss("huber"), "haze": OpacityEntropyLoss(0.1)}
+    trainer(num_steps=1, losses=losses).fit(small_renderer(), frames, callbacks=[lambda r, _: records.append(r)])
+    terms = records[0].losses
+    assert terms.keys() == {"loss", "rgb", "haze"}
+    assert math.isclose(terms["loss"], terms["rgb"] + terms["haze"], rel_tol=1e-5)
+    assert terms["haze"] > 0
