@@ -64,6 +64,4 @@ class RandomBackground(ConstantBackground):
         """Random colours (R, 3) in training mode, the constant one in evaluation mode."""
         if not self.training:
             return super().forward(directions)
-        return torch.rand(
-            directions.shape[0], 3, generator=generator, dtype=directions.dtype, device=directions.device
-        )
+        return torch.rand(directions.shape[0], 3, generator=generator, dtype=directions.dtype, device=directions.device)

@@ -12,6 +12,8 @@ from dnerf.data.frames import Frames
 from dnerf.metrics import psnr, ssim
 from dnerf.renderer import Renderer
 
+MAX_PSNR = 100.0
+
 
 @dataclass(frozen=True)
 class FrameScore:
@@ -20,7 +22,7 @@ class FrameScore:
     Args:
         index: in its split.
         time: in [0, 1].
-        psnr: in dB.
+        psnr: in dB, at most `MAX_PSNR` (identical pictures would be infinite).
         ssim: in [-1, 1].
     """
 
@@ -77,7 +79,7 @@ def evaluate(
         chunk: rays rendered at a time.
         on_frame: called with score, prediction (H, W, 3) and truth (H, W, 3) of every frame.
     """
-    device = next(renderer.parameters()).device
+    device = renderer.device
     frames = frames.to(device)
     was_training = renderer.training
     renderer.eval()
@@ -91,7 +93,7 @@ def evaluate(
             torch.cuda.synchronize(device)
         seconds += time.perf_counter() - begin
         truth = frames.image(i, background)
-        score = FrameScore(i, moment, psnr(prediction, truth), ssim(prediction, truth))
+        score = FrameScore(i, moment, min(psnr(prediction, truth), MAX_PSNR), ssim(prediction, truth))
         scores.append(score)
         if on_frame is not None:
             on_frame(score, prediction, truth)

@@ -33,9 +33,7 @@ def ray_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, T
     return enter, leave
 
 
-def clip_to_box(
-    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, box: Tensor
-) -> tuple[Tensor, Tensor]:
+def clip_to_box(origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
     """Shorten [near, far] to its part inside a box; rays without one get the empty interval far = near.
 
     Args and Returns as `ray_box`; near and far are (R,) and finite, so are the results.

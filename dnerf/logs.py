@@ -12,6 +12,8 @@ from dnerf.renderer import Renderer
 from dnerf.training import TrainingRecord
 from dnerf.video import contact_sheet, error_map, write_png
 
+SHEET_COLUMNS = ("prediction", "truth", "error (yellow: 0.2 or more)")
+
 
 class JsonLinesLog:
     """Appends every training record to a file, one JSON object a line, flushed at once.
@@ -58,7 +60,7 @@ class Previews:
         score, prediction, truth = scores[0]
         sheet = contact_sheet(
             [[prediction, truth, error_map(prediction, truth)]],
-            columns=["prediction", "truth", "error"],
+            columns=SHEET_COLUMNS,
             rows=[f"step {record.step}: {score.psnr:.2f} dB"],
         )
         write_png(sheet, self.folder / f"step_{record.step:07d}.png")

@@ -45,11 +45,12 @@ class MLP(nn.Module):
             (in_features if i == 0 else hidden_features) + (in_features if i in self.skips else 0)
             for i in range(num_layers)
         ]
-        self.hidden = nn.ModuleList(nn.Linear(width, hidden_features) for width in widths)
+        hidden = [nn.Linear(width, hidden_features) for width in widths]
+        self.hidden = nn.ModuleList(hidden)
         last = hidden_features if num_layers else in_features
         self.output = None if out_features is None else nn.Linear(last, out_features)
         self.out_features = last if out_features is None else out_features
-        for layer in self.hidden:
+        for layer in hidden:
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
         if zero_output and self.output is not None:

@@ -131,9 +131,7 @@ class Samples:
 
     def positions(self, rays: Rays) -> Tensor:
         """World positions at which the field is evaluated, (R, S, 3) or (N, 3)."""
-        return torch.addcmul(
-            self.per_sample(rays.origins), self.distances[..., None], self.per_sample(rays.directions)
-        )
+        return torch.addcmul(self.per_sample(rays.origins), self.distances[..., None], self.per_sample(rays.directions))
 
     def packed(self, mask: Tensor | None = None) -> "Samples":
         """Return dense samples as packed ones, only those where `mask` (R, S) holds (all if None)."""

@@ -1,5 +1,7 @@
 """The renderer: rays -> sampler -> field -> composite. It is the whole trainable model."""
 
+from itertools import chain
+
 import torch
 from torch import nn
 
@@ -43,6 +45,11 @@ class Renderer(nn.Module):
         self.background = ConstantBackground("white") if background is None else background
         self.precision = precision
 
+    @property
+    def device(self) -> torch.device:
+        """Where the model lives."""
+        return next(chain(self.parameters(), self.buffers())).device
+
     def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Rendering:
         """Render R rays.
 
@@ -63,7 +70,7 @@ class Renderer(nn.Module):
 
     def update(self, step: int) -> None:
         """Let the sampler learn from the field, between training steps; `step` counts those done."""
-        with self._autocast(next(self.parameters()).device):
+        with self._autocast(self.device):
             self.sampler.update(self.field, step)
 
     def _autocast(self, device: torch.device) -> torch.autocast:
@@ -73,8 +80,9 @@ class Renderer(nn.Module):
     def set_progress(self, progress: float) -> None:
         """Tell every module that changes while training goes on (encoding windows) where it stands, in [0, 1]."""
         for module in self.modules():
-            if module is not self and hasattr(module, "set_progress"):
-                module.set_progress(progress)
+            listener = getattr(module, "set_progress", None)
+            if module is not self and callable(listener):
+                listener(progress)
 
     @torch.no_grad()
     def render_image(self, camera: Camera, time: float, *, chunk: int = 16384) -> Rendering:

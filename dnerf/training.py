@@ -142,7 +142,7 @@ class Trainer:
         """
         if isinstance(renderer.background, RandomBackground) and not frames.has_alpha:
             raise ValueError("background: a random one needs frames with alpha, these have none")
-        device = next(renderer.parameters()).device
+        device = renderer.device
         frames = frames.to(device)
         generator = torch.Generator(device).manual_seed(seed)
         optimizer = self._optimizer(renderer)
@@ -170,9 +170,7 @@ class Trainer:
                 if is_record or done:
                     values = {name: float(term) for name, term in terms.items()}
                     _check_finite(values, step, renderer)
-                    record = TrainingRecord(
-                        step, seconds, values, _psnr(float(mse)), used_rays, num_samples, factor
-                    )
+                    record = TrainingRecord(step, seconds, values, _psnr(float(mse)), used_rays, num_samples, factor)
                     for callback in callbacks:
                         callback(record, renderer)
                     _show(bar, record, progress, rays_done)

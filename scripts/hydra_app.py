@@ -129,7 +129,7 @@ def load_config(run: str) -> DictConfig:
         raise ValueError(f"run: {path} does not exist; {run} is not the folder of a run")
     try:
         config = OmegaConf.load(path)
-    except Exception as error:  # noqa: BLE001 - YAML readers raise many kinds; all mean a broken file
+    except Exception as error:
         raise ValueError(f"{path}: not a readable config ({_one_line(error)})") from error
     if not isinstance(config, DictConfig) or "renderer" not in config or "data" not in config:
         raise ValueError(f"{path}: expected a mapping with renderer and data, not the config of a run")
@@ -151,6 +151,8 @@ def load_renderer(run: str, config: DictConfig, device: torch.device) -> Rendere
     """
     renderer = build(config.renderer)
     if not isinstance(renderer, Renderer):
-        raise ValueError(f"{run}/config.yaml: renderer must be a dnerf.renderer.Renderer, got {type(renderer).__name__}")
+        raise ValueError(
+            f"{run}/config.yaml: renderer must be a dnerf.renderer.Renderer, got {type(renderer).__name__}"
+        )
     load_weights(renderer, Path(run) / "model.safetensors")
     return renderer.to(device).eval()

@@ -8,6 +8,7 @@ from torch import Tensor
 from dnerf.data import DataSource
 from dnerf.evaluation import FrameScore, evaluate
 from dnerf.files import write_json
+from dnerf.logs import SHEET_COLUMNS
 from dnerf.renderer import Renderer
 from dnerf.video import contact_sheet, error_map, write_png
 
@@ -32,7 +33,7 @@ def evaluate_run(folder: Path, renderer: Renderer, data: DataSource, split: str)
             labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")
 
     metrics = {**evaluate(renderer, frames, split, on_frame=keep).as_dict(), **training}
-    write_png(contact_sheet(rows, columns=["prediction", "truth", "error"], rows=labels), sheet_path(folder, split))
+    write_png(contact_sheet(rows, columns=SHEET_COLUMNS, rows=labels), sheet_path(folder, split))
     write_json(folder / "metrics.json", metrics)
     return metrics
 

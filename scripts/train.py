@@ -27,9 +27,7 @@ def main(config: DictConfig) -> None:
     size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
     print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {device}")
     with_writer = tensorboard_writer(folder / "tensorboard") if config.tensorboard else None
-    record = trainer.fit(
-        renderer, frames, seed=config.seed, callbacks=_callbacks(config, folder, data, with_writer)
-    )
+    record = trainer.fit(renderer, frames, seed=config.seed, callbacks=_callbacks(config, folder, data, with_writer))
     save_weights(renderer, folder / "model.safetensors")
     training = {
         "train_seconds": record.seconds,

@@ -19,8 +19,8 @@ def seeded(seed: int) -> torch.Generator:
     [("white", (1, 1, 1)), ("black", (0, 0, 0)), ([0.25, 0.5, 1], (0.25, 0.5, 1)), ((0, 0, 0), (0, 0, 0))],
 )
 def test_colours_have_names_or_numbers(color: object, expected: tuple[float, ...]) -> None:
-    assert parse_color(color) == expected  # type: ignore[arg-type]
-    background = ConstantBackground(color)(DIRECTIONS)  # type: ignore[arg-type]
+    assert parse_color(color) == expected
+    background = ConstantBackground(color)(DIRECTIONS)
     assert background.shape == (1000, 3)
     assert (background == torch.tensor(expected)).all()
 
@@ -28,7 +28,7 @@ def test_colours_have_names_or_numbers(color: object, expected: tuple[float, ...
 @pytest.mark.parametrize("color", ["red", "", [0, 0], [0, 0, 0, 0], [0, 0, 1.5], [-0.1, 0, 0], [math.nan, 0, 0]])
 def test_other_colours_are_refused(color: object) -> None:
     with pytest.raises(ValueError, match="color must be"):
-        ConstantBackground(color)  # type: ignore[arg-type]
+        ConstantBackground(color)
 
 
 def test_random_background_is_another_uniform_colour_for_every_ray_in_training() -> None:

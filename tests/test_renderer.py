@@ -198,7 +198,7 @@ def test_images_leave_every_modules_mode_as_it_was() -> None:
 class Broken(StratifiedSampler):
     """Fails when asked."""
 
-    def forward(self, *args: object, **kwargs: object) -> None:  # type: ignore[override]
+    def forward(self, *args: object, **kwargs: object) -> None:
         raise RuntimeError("broken")
 
 

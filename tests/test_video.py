@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -94,6 +95,13 @@ def test_a_video_that_does_not_fit_the_disk_is_an_error_and_vanishes(tmp_path: P
             write_frames(frames, tmp_path / "a.mp4", quality=10)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_video_that_lacks_frames_is_an_error_and_vanishes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", lambda path: (3, 0.1))
+    with pytest.raises(OSError, match="ffmpeg wrote 3 of 4 frames"):
+        write_frames(smooth_frames(4), tmp_path / "a.mp4")
     assert not any(tmp_path.iterdir())
 
 

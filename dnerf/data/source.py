@@ -36,9 +36,9 @@ class BlenderData(DataSource):
         root: folder that holds `transforms_<split>.json`.
         resolution: width in pixels after area averaging; None keeps the files' size.
         box: (2, 3) corners of what is modelled, in world units.
-        near: z-depth where rays begin.
-        far: z-depth where they end.
-        pixel_origin: "center", or "corner" as D-NeRF's code.
+        near: z-depth where rays begin; None takes what the file says, 2 if nothing.
+        far: z-depth where they end; None takes what the file says, 6 if nothing.
+        pixel_origin: "center", or "corner" as D-NeRF's code; None takes what the file says, "center" if nothing.
     """
 
     def __init__(
@@ -47,9 +47,9 @@ class BlenderData(DataSource):
         resolution: int | None = 400,
         box: Sequence[Sequence[float]] = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)),
         *,
-        near: float = 2.0,
-        far: float = 6.0,
-        pixel_origin: str = "center",
+        near: float | None = None,
+        far: float | None = None,
+        pixel_origin: str | None = None,
     ) -> None:
         self.root = root
         self.resolution = resolution

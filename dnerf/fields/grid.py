@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import as_box, check_positive
+from dnerf.checks import as_box, check_positive, check_shape
 from dnerf.compositing import FieldOutput
 from dnerf.deformations.base import check_positions_times
 from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
@@ -75,14 +75,13 @@ class GridField(RadianceField):
             self.head = MLP(in_features, hidden_features, num_layers, out_features=4)
         else:
             self.head = MLP(in_features, hidden_features, num_layers, out_features=1 + hidden_features)
-            self.to_rgb = MLP(
-                hidden_features + self.encode_directions.out_features, hidden_features, 1, out_features=3
-            )
+            self.to_rgb = MLP(hidden_features + self.encode_directions.out_features, hidden_features, 1, out_features=3)
 
     def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
         check_positions_times(positions, times)
         unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
-        features = grid_encode(unit.reshape(-1, 3), self.table, self.levels).unflatten(0, positions.shape[:-1])
+        features = grid_encode(unit.reshape(-1, 3), self.table, self.levels)
+        features = features.reshape(*positions.shape[:-1], features.shape[-1])
         if self.encode_times is not None:
             features = torch.cat([features, self.encode_times(times[..., None])], dim=-1)
         return self.head(features)
@@ -100,5 +99,6 @@ class GridField(RadianceField):
         density = self._density(raw)
         color = raw[..., 1:]
         if self.encode_directions is not None:
+            check_shape("directions", directions, positions.shape)
             color = self.to_rgb(torch.cat([torch.relu(color), self.encode_directions(directions)], dim=-1))
         return FieldOutput(density=density, rgb=torch.sigmoid(color.to(density.dtype)))

@@ -66,9 +66,7 @@ def choose(tensor: Tensor) -> str:
     if name == "numba" and not tensor.is_cpu:
         raise ValueError(f"kernel backend 'numba' needs tensors on the CPU, got {tensor.device}")
     if name == "triton" and not (tensor.is_cuda or os.environ.get("TRITON_INTERPRET") == "1"):
-        raise ValueError(
-            f"kernel backend 'triton' needs CUDA tensors (or TRITON_INTERPRET=1), got {tensor.device}"
-        )
+        raise ValueError(f"kernel backend 'triton' needs CUDA tensors (or TRITON_INTERPRET=1), got {tensor.device}")
     return name
 
 

@@ -34,9 +34,7 @@ class GridLevels:
     max_rows: int
 
     def __post_init__(self) -> None:
-        triples = tuple(
-            (r, r, r) if isinstance(r, int) else tuple(int(c) for c in r) for r in self.resolutions
-        )
+        triples = tuple((r, r, r) if isinstance(r, int) else tuple(int(c) for c in r) for r in self.resolutions)
         if not triples or any(len(r) != 3 or min(r) < 1 for r in triples):
             raise ValueError(f"resolutions must be positive ints or triples of them, got {self.resolutions}")
         if not 0 < self.max_rows < 2**31 or self.max_rows & (self.max_rows - 1):
@@ -119,9 +117,7 @@ def grid_encode(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:
 
 def grid_encode_reference(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:
     """The definition of `grid_encode` in plain torch; any device and float dtype, differentiable to any order."""
-    corners = torch.tensor(
-        [(k & 1, k >> 1 & 1, k >> 2) for k in range(8)], dtype=torch.int64, device=positions.device
-    )
+    corners = torch.tensor([(k & 1, k >> 1 & 1, k >> 2) for k in range(8)], dtype=torch.int64, device=positions.device)
     clamped = positions.clamp(0, 1)
     features = []
     for rx, ry, rz, offset, mask in levels.describe():
@@ -150,9 +146,7 @@ def _grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int]
 
 
 @torch.library.custom_op("dnerf::grid_encode_grad_positions", mutates_args=())
-def _grad_positions(
-    grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int
-) -> Tensor:
+def _grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "grad_positions", grad, positions, table, cells, max_rows)
 
 

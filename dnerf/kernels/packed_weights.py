@@ -52,9 +52,7 @@ def packed_weights_reference(optical_depth: Tensor, offsets: Tensor) -> Tensor:
 def check_offsets(offsets: Tensor) -> None:
     """Raise ValueError unless the offsets can be those of packed samples, as far as shape and dtype say."""
     if offsets.ndim != 1 or offsets.shape[0] < 1 or offsets.dtype != torch.int64:
-        raise ValueError(
-            f"offsets must be int64 of shape (R + 1,), got {offsets.dtype} {tuple(offsets.shape)}"
-        )
+        raise ValueError(f"offsets must be int64 of shape (R + 1,), got {offsets.dtype} {tuple(offsets.shape)}")
 
 
 @torch.library.custom_op("dnerf::packed_weights", mutates_args=())

@@ -14,9 +14,7 @@ class Sampler(nn.Module, ABC):
     """Places samples along rays. Training mode may place them at random, evaluation mode never does."""
 
     @abstractmethod
-    def forward(
-        self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None
-    ) -> Samples:
+    def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Samples along R rays, dense or packed; no gradient flows to where they lie.
 
         Args:

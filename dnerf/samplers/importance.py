@@ -43,17 +43,13 @@ class ImportanceSampler(Sampler):
         self.num_fine = num_fine
         self.proposal = proposal
 
-    def forward(
-        self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None
-    ) -> Samples:
+    def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Dense samples (R, num_coarse + num_fine), with the coarse pass in `proposals` if it has its own network."""
         coarse = self.coarse(rays, field, generator=generator)
         density, proposals = self._coarse_pass(rays, coarse, field)
         weights = render_weights(density.detach() * coarse.lengths, coarse)
         edges = torch.cat([coarse.starts, coarse.ends[:, -1:]], dim=-1)
-        drawn = sample_piecewise_constant(
-            edges, weights, self.num_fine, randomized=self.training, generator=generator
-        )
+        drawn = sample_piecewise_constant(edges, weights, self.num_fine, randomized=self.training, generator=generator)
         merged = torch.cat([edges, drawn], dim=-1).sort(dim=-1).values
         starts, ends = merged[:, :-1], merged[:, 1:]
         points = random_points(starts, ends, generator) if self.training else None

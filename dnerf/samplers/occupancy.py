@@ -90,9 +90,7 @@ class OccupancySampler(Sampler):
         self.maxima: Tensor
         self.occupied: Tensor
 
-    def forward(
-        self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None
-    ) -> Samples:
+    def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Packed samples; intervals begin at random offsets in training, at multiples of the step in evaluation."""
         jitter = torch.zeros_like(rays.near)
         if self.training:

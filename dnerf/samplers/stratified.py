@@ -30,9 +30,7 @@ class StratifiedSampler(Sampler):
         self.num_samples = num_samples
         self.clip = RayClip(box)
 
-    def forward(
-        self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None
-    ) -> Samples:
+    def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Dense samples (R, num_samples)."""
         near, far = self.clip(rays)
         steps = torch.linspace(0, 1, self.num_samples + 1, dtype=near.dtype, device=near.device)

@@ -11,6 +11,7 @@ from dnerf.compositing import FieldOutput, safe_divide
 from dnerf.fields.base import RadianceField
 from dnerf.rays import Rays, Samples
 from dnerf.scenes.bodies import Body
+from dnerf.scenes.motions import world_poses
 from dnerf.scenes.poses import Pose
 from dnerf.scenes.quadrature import MAX_DEPTH, absorption_rule
 
@@ -162,10 +163,10 @@ class AnalyticScene(RadianceField):
         Poses are worked out once for each distinct time: pictures of one moment need one.
         """
         distinct, index = torch.unique(times, return_inverse=True)
-        for body in self.bodies:
-            # Matrices of a chain of joints need full precision whatever the networks run in.
-            with torch.autocast(times.device.type, enabled=False):
-                pose = body.motion.pose(distinct)
+        # Chains of joints need full precision whatever the networks run in.
+        with torch.autocast(times.device.type, enabled=False):
+            poses = world_poses([body.motion for body in self.bodies], distinct)
+        for body, pose in zip(self.bodies, poses):
             yield body, pose.take(index)
 
 

@@ -2,13 +2,14 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from dnerf.geometry import so3_exp
-from dnerf.scenes.poses import Pose
+from dnerf.scenes.poses import Pose, turn
 
 Vector = tuple[float, float, float]
 
@@ -41,11 +42,30 @@ class Wave:
 
 
 class Motion(ABC):
-    """Where a body's frame is at each time."""
+    """Where a body's frame is at each time, relative to a parent's frame or to the world."""
+
+    parent: "Motion | None" = None
 
     @abstractmethod
+    def relative(self, times: Tensor) -> Pose:
+        """Pose of the frame in its parent's at times (...,)."""
+
     def pose(self, times: Tensor) -> Pose:
         """Pose of the frame in the world at times (...,)."""
+        return world_poses([self], times)[0]
+
+
+def world_poses(motions: Sequence[Motion], times: Tensor) -> list[Pose]:
+    """Poses of several frames in the world at times (...,), each link that they share worked out once."""
+    known: dict[int, Pose] = {}
+
+    def resolve(motion: Motion) -> Pose:
+        if id(motion) not in known:
+            own = motion.relative(times)
+            known[id(motion)] = own if motion.parent is None else resolve(motion.parent).then(own)
+        return known[id(motion)]
+
+    return [resolve(motion) for motion in motions]
 
 
 @dataclass(frozen=True)
@@ -60,7 +80,7 @@ class Fixed(Motion):
     translation: Vector = (0.0, 0.0, 0.0)
     rotation_vector: Vector = (0.0, 0.0, 0.0)
 
-    def pose(self, times: Tensor) -> Pose:
+    def relative(self, times: Tensor) -> Pose:
         """The same pose at every time."""
         rotation = so3_exp(constant(self.rotation_vector, times))
         translation = constant(self.translation, times)
@@ -86,7 +106,7 @@ class Orbit(Motion):
     tilt: float = 0.0
     center: Vector = (0.0, 0.0, 0.0)
 
-    def pose(self, times: Tensor) -> Pose:
+    def relative(self, times: Tensor) -> Pose:
         """Pose on the circle."""
         angle = 2 * math.pi * (self.turns * times + self.phase)
         along, across = self.radius * torch.cos(angle), self.radius * torch.sin(angle)
@@ -100,22 +120,22 @@ class Joint(Motion):
     """A frame hinged to a parent's at a point, turning about an axis.
 
     Args:
-        parent: motion of the frame it hangs on.
+        parent: motion of the frame it hangs on; the world if None.
         offset: the joint, in the parent's frame.
-        axis: unit vector in the parent's frame.
+        axis: in the parent's frame.
         angle: in radians.
     """
 
-    parent: Motion = field(default_factory=Fixed)
+    parent: Motion | None = None
     offset: Vector = (0.0, 0.0, 0.0)
     axis: Vector = (0.0, 0.0, 1.0)
     angle: Wave = field(default_factory=Wave)
 
-    def pose(self, times: Tensor) -> Pose:
-        """The parent's pose, then the joint's."""
-        rotation = so3_exp(self.angle(times)[..., None] * constant(self.axis, times))
+    def relative(self, times: Tensor) -> Pose:
+        """The joint."""
+        rotation = turn(self.axis, self.angle(times))
         offset = constant(self.offset, times).expand(*times.shape, 3)
-        return self.parent.pose(times).then(Pose(rotation, offset, torch.ones_like(times)))
+        return Pose(rotation, offset, torch.ones_like(times))
 
 
 @dataclass(frozen=True)
@@ -123,20 +143,20 @@ class Spin(Motion):
     """A frame that turns at constant speed relative to its parent.
 
     Args:
-        parent: motion of the frame it turns in.
-        axis: unit vector in the parent's frame.
+        parent: motion of the frame it turns in; the world if None.
+        axis: in the parent's frame.
         turns: while t goes from 0 to 1.
     """
 
-    parent: Motion = field(default_factory=Fixed)
+    parent: Motion | None = None
     axis: Vector = (0.0, 0.0, 1.0)
     turns: float = 1.0
 
-    def pose(self, times: Tensor) -> Pose:
-        """The parent's pose, then the turn."""
-        rotation = so3_exp((2 * math.pi * self.turns * times)[..., None] * constant(self.axis, times))
+    def relative(self, times: Tensor) -> Pose:
+        """The turn so far."""
+        rotation = turn(self.axis, 2 * math.pi * self.turns * times)
         identity = Pose.identity(times)
-        return self.parent.pose(times).then(Pose(rotation, identity.translation, identity.scale))
+        return Pose(rotation, identity.translation, identity.scale)
 
 
 @dataclass(frozen=True)
@@ -144,20 +164,20 @@ class Slide(Motion):
     """A frame that moves to and fro along an axis of its parent.
 
     Args:
-        parent: motion of the frame it slides in.
+        parent: motion of the frame it slides in; the world if None.
         axis: direction in the parent's frame.
         distance: along the axis, in world units if the axis is a unit vector.
     """
 
-    parent: Motion = field(default_factory=Fixed)
+    parent: Motion | None = None
     axis: Vector = (0.0, 0.0, 1.0)
     distance: Wave = field(default_factory=Wave)
 
-    def pose(self, times: Tensor) -> Pose:
-        """The parent's pose, then the shift."""
+    def relative(self, times: Tensor) -> Pose:
+        """The shift."""
         shift = self.distance(times)[..., None] * constant(self.axis, times)
         identity = Pose.identity(times)
-        return self.parent.pose(times).then(Pose(identity.rotation, shift, identity.scale))
+        return Pose(identity.rotation, shift, identity.scale)
 
 
 @dataclass(frozen=True)
@@ -165,14 +185,14 @@ class Pulse(Motion):
     """A frame that grows and shrinks about its origin.
 
     Args:
-        parent: motion of the frame it pulses in.
+        parent: motion of the frame it pulses in; the world if None.
         scale: factor, positive at all times.
     """
 
-    parent: Motion = field(default_factory=Fixed)
+    parent: Motion | None = None
     scale: Wave = field(default_factory=lambda: Wave(1.0))
 
-    def pose(self, times: Tensor) -> Pose:
-        """The parent's pose, then the scaling."""
+    def relative(self, times: Tensor) -> Pose:
+        """The scaling."""
         identity = Pose.identity(times)
-        return self.parent.pose(times).then(Pose(identity.rotation, identity.translation, self.scale(times)))
+        return Pose(identity.rotation, identity.translation, self.scale(times))

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dnerf.geometry import skew
+
 
 def rotate(matrices: Tensor, vectors: Tensor) -> Tensor:
     """Apply matrices (..., 3, 3) to vectors (..., 3), broadcasting.
@@ -13,6 +15,18 @@ def rotate(matrices: Tensor, vectors: Tensor) -> Tensor:
     """
     x, y, z = vectors.unsqueeze(-2).unbind(-1)
     return x * matrices[..., 0] + y * matrices[..., 1] + z * matrices[..., 2]
+
+
+def turn(axis: tuple[float, float, float], angles: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) about a fixed axis of any positive length by angles (...,) in radians.
+
+    Rodrigues with the axis known: no division by the angle, a tenth of the work of `so3_exp`.
+    """
+    direction = torch.tensor(axis, dtype=angles.dtype, device=angles.device)
+    direction = direction / direction.norm()
+    eye = torch.eye(3, dtype=angles.dtype, device=angles.device)
+    sine, versine = torch.sin(angles)[..., None, None], 2 * torch.sin(0.5 * angles)[..., None, None] ** 2
+    return eye + sine * skew(direction) + versine * (direction[:, None] * direction - eye)
 
 
 @dataclass(frozen=True)
@@ -55,4 +69,5 @@ class Pose:
 
     def then(self, child: "Pose") -> "Pose":
         """Pose of a frame that is given relative to this one."""
-        return Pose(self.rotation @ child.rotation, self.to_world(child.translation), self.scale * child.scale)
+        columns = [rotate(self.rotation, child.rotation[..., i]) for i in range(3)]
+        return Pose(torch.stack(columns, -1), self.to_world(child.translation), self.scale * child.scale)

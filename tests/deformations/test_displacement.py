@@ -9,7 +9,7 @@ from dnerf.deformations import DisplacementDeformation
 
 
 def trained(**arguments: object) -> DisplacementDeformation:
-    deformation = DisplacementDeformation(3, 16, (1,), **arguments)  # type: ignore[arg-type]
+    deformation = DisplacementDeformation(3, 16, (1,), **arguments)
     for parameter in deformation.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     return deformation

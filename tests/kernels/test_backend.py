@@ -15,9 +15,7 @@ def test_unknown_backend_is_named():
 
 
 def test_misspelt_environment_variable_is_named_on_first_use():
-    code = (
-        "import torch\nfrom dnerf import kernels\nkernels.packed_weights(torch.ones(1), torch.tensor([0, 1]))"
-    )
+    code = "import torch\nfrom dnerf import kernels\nkernels.packed_weights(torch.ones(1), torch.tensor([0, 1]))"
     result = subprocess.run(
         [sys.executable, "-c", code],
         env={"DNERF_KERNELS": "nunba"},

@@ -58,9 +58,7 @@ def test_levels_describe_the_table():
     assert LEVELS.num_rows == LEVELS.offsets[-1]
 
 
-@pytest.mark.parametrize(
-    ("resolutions", "max_rows"), [((), 8), ((0,), 8), (((2, 2),), 8), ((2,), 12), ((2,), 0)]
-)
+@pytest.mark.parametrize(("resolutions", "max_rows"), [((), 8), ((0,), 8), (((2, 2),), 8), ((2,), 12), ((2,), 0)])
 def test_impossible_levels_are_refused(resolutions, max_rows):
     with pytest.raises(ValueError, match="got"):
         GridLevels(resolutions, max_rows)
@@ -129,9 +127,7 @@ def test_gradcheck(compiled):
     # Away from the faces of cells, where the function has kinks.
     positions = (positions.clamp(0.03, 0.97) + 0.017).to(compiled).requires_grad_()
     table = table.to(compiled).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda p, t: grid_encode(p, t, levels), (positions, table), nondet_tol=1e-12
-    )
+    assert torch.autograd.gradcheck(lambda p, t: grid_encode(p, t, levels), (positions, table), nondet_tol=1e-12)
 
 
 def test_positions_outside_are_clamped_and_have_no_gradient_there(compiled):

@@ -159,9 +159,7 @@ def test_full_grid_is_covered_from_entry_to_exit(compiled):
     assert result.starts[0] == 2
     assert result.ends[-1] == 4
     assert torch.equal(result.starts[1:], result.ends[:-1])
-    torch.testing.assert_close(
-        result.ends[1:-1] - result.starts[1:-1], torch.full((6,), 0.3, device=compiled)
-    )
+    torch.testing.assert_close(result.ends[1:-1] - result.starts[1:-1], torch.full((6,), 0.3, device=compiled))
     torch.testing.assert_close(result.ends[0] % 0.3, 0.075 * ones[0])
 
 
@@ -223,9 +221,7 @@ def test_wrong_arguments_are_refused(change, message):
 def test_opcheck():
     arguments = rays(6)
     order = ("origins", "directions", "near", "far", "times", "jitter")
-    torch.library.opcheck(
-        torch.ops.dnerf.march.default, (*(arguments[k] for k in order), grid(), BOX, 0.1, None, None)
-    )
+    torch.library.opcheck(torch.ops.dnerf.march.default, (*(arguments[k] for k in order), grid(), BOX, 0.1, None, None))
 
 
 def test_compiles_without_graph_breaks():

@@ -27,9 +27,7 @@ COUNTS = (0, 3, 1, 0, 100, 0)
 def test_reference_equals_loop(reference):
     values, weights, offsets = packed(COUNTS)
     pairs = list(zip(offsets.tolist(), offsets[1:].tolist()))
-    expected = torch.stack(
-        [sum((weights[i] * values[i] for i in range(a, b)), values.new_zeros(3)) for a, b in pairs]
-    )
+    expected = torch.stack([sum((weights[i] * values[i] for i in range(a, b)), values.new_zeros(3)) for a, b in pairs])
     torch.testing.assert_close(packed_sum(values, weights, offsets), expected)
 
 

@@ -87,14 +87,14 @@ def test_one_spike_gets_every_sample(bin_index: int, weight: float, randomized: 
     assert (drawn.max() - drawn.min()).item() > 0.9 * 0.25
 
 
-def test_the_last_random_number_does_not_fall_off_the_histogram(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The largest float32 below 1 rounds the last stratum up to u = 1, behind the empty bins at the end."""
-    largest = 1 - 2**-24
-    monkeypatch.setattr(torch, "rand", lambda size, **options: torch.full(size, largest, dtype=options["dtype"]))
-    edges, weights = torch.linspace(0, 4, 5)[None], torch.tensor([[1.0, 1.0, 0.0, 0.0]])
+@pytest.mark.parametrize("extreme", [0.0, 1 - 2**-24])
+def test_extreme_random_numbers_stay_out_of_empty_bins(monkeypatch: pytest.MonkeyPatch, extreme: float) -> None:
+    """0 lies before the empty bins at the start; the largest float32 below 1 rounds the last stratum to u = 1."""
+    monkeypatch.setattr(torch, "rand", lambda size, **options: torch.full(size, extreme, dtype=options["dtype"]))
+    edges, weights = torch.linspace(0, 6, 7)[None], torch.tensor([[0.0, 0.0, 1.0, 1.0, 0.0, 0.0]])
     drawn = sample_piecewise_constant(edges, weights, 64, randomized=True)
-    assert (drawn <= 2).all()
-    assert drawn[0, -1].item() == pytest.approx(2, abs=1e-6)
+    assert (drawn >= 2).all()
+    assert (drawn <= 4).all()
 
 
 def test_huge_dynamic_range_keeps_its_proportions() -> None:

@@ -26,8 +26,8 @@ SAMPLERS: dict[str, Callable[[], Sampler]] = {
     "stratified in a box": lambda: StratifiedSampler(16, BOX),
     "importance, shared network": lambda: ImportanceSampler(8, 12),
     "importance, own proposal": lambda: ImportanceSampler(8, 12, soft_ball(width=0.6)),
-    "occupancy, all occupied": lambda: OccupancySampler(BOX.tolist(), 0.1, 8, num_slabs=4),
-    "occupancy, filled in a box": filled_occupancy,
+    "occupancy, all of a box": lambda: OccupancySampler(BOX.tolist(), 0.1, 8, num_slabs=4),
+    "occupancy, filled": filled_occupancy,
     "importance in a box": lambda: ImportanceSampler(8, 12, box=BOX),
 }
 

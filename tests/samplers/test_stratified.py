@@ -53,7 +53,7 @@ def test_number_of_samples_must_be_positive(num_samples: int) -> None:
 
 
 def test_box_may_be_nested_lists_and_must_not_be_empty() -> None:
-    sampler = StratifiedSampler(4, [[-1, -1, -1], [1, 1, 1]])  # type: ignore[arg-type]
+    sampler = StratifiedSampler(4, [[-1, -1, -1], [1, 1, 1]])
     assert sampler.state_dict() == {}
     with pytest.raises(ValueError, match="box must have finite corners"):
-        StratifiedSampler(4, [[1, -1, -1], [1, 1, 1]])  # type: ignore[arg-type]
+        StratifiedSampler(4, [[1, -1, -1], [1, 1, 1]])

@@ -121,9 +121,7 @@ def _forward(positions: Any, table: Any, levels: Any, out: Any, lanes: Any) -> N
 
 
 @njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
-def _grad_table(
-    grad: Any, positions: Any, levels: Any, part_bits: int, num_workers: int, out: Any, lanes: Any
-) -> None:
+def _grad_table(grad: Any, positions: Any, levels: Any, part_bits: int, num_workers: int, out: Any, lanes: Any) -> None:
     """Scatter-add without atomics: a task owns one level, or every 2^part_bits-th block of its rows.
 
     Each row is added to by one thread, in the order of the samples: the result depends on no thread count.

@@ -43,9 +43,7 @@ def march(
     if skips is None:
         skips = skip_distances(occupancy)
     reach = skips.contiguous().numpy()
-    launch(
-        _mark, o, d, t0, times_, jitter_, grid, reach, box, size, limit, ranges, counts, kept, offsets.numpy()
-    )
+    launch(_mark, o, d, t0, times_, jitter_, grid, reach, box, size, limit, ranges, counts, kept, offsets.numpy())
     torch.cumsum(offsets, 0, out=offsets)
 
     num_samples = int(offsets[-1])

@@ -37,9 +37,7 @@ def _splat(builder: Any, value: Any, width: int) -> Any:
 
 
 @intrinsic
-def blend_rows(
-    typing: Any, table: Any, rows: Any, weights: Any, out: Any, start: Any, lanes: Any
-) -> tuple[Any, Any]:
+def blend_rows(typing: Any, table: Any, rows: Any, weights: Any, out: Any, start: Any, lanes: Any) -> tuple[Any, Any]:
     """out.flat[start : start + F] = sum_k weights[k] * table[rows[k]], for tuples of rows and weights."""
     width = lanes.count
 
@@ -59,9 +57,7 @@ def blend_rows(
 
 
 @intrinsic
-def add_to_row(
-    typing: Any, table: Any, row: Any, weight: Any, values: Any, start: Any, lanes: Any
-) -> tuple[Any, Any]:
+def add_to_row(typing: Any, table: Any, row: Any, weight: Any, values: Any, start: Any, lanes: Any) -> tuple[Any, Any]:
     """table[row] += weight * values.flat[start : start + F]."""
     width = lanes.count
 

@@ -179,9 +179,7 @@ def _grad_positions(
         y, v = _locate(positions, samples, valid, levels, level, 1)
         z, w = _locate(positions, samples, valid, levels, level, 2)
         columns = level * num_features + features
-        gradients = tl.load(
-            grad + samples[:, None] * (num_levels * num_features) + columns[None, :], mask, 0.0
-        )
+        gradients = tl.load(grad + samples[:, None] * (num_levels * num_features) + columns[None, :], mask, 0.0)
         along_x, along_y, along_z = tl.zeros_like(grad_x), tl.zeros_like(grad_y), tl.zeros_like(grad_z)
         for k in tl.static_range(8):
             rows = _row(x + (k & 1), y + (k >> 1 & 1), z + (k >> 2), levels, level)

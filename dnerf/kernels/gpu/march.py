@@ -43,18 +43,14 @@ def march(
     # Fused multiply-adds would round differently from the definition.
     options = {"num_warps": 1, "enable_fp_fusion": False}
     if num_rays:
-        _march[(num_rays,)](
-            *arguments, offsets, near, near, offsets, *occupancy.shape, False, BLOCK, **options
-        )
+        _march[(num_rays,)](*arguments, offsets, near, near, offsets, *occupancy.shape, False, BLOCK, **options)
         torch.cumsum(offsets, 0, out=offsets)
     # The number of samples decides the outputs' size: the one point where the host waits for the device.
     num_samples = int(offsets[-1])
     starts, ends = near.new_empty(num_samples), near.new_empty(num_samples)
     ray_indices = offsets.new_empty(num_samples)
     if num_samples:
-        _march[(num_rays,)](
-            *arguments, offsets, starts, ends, ray_indices, *occupancy.shape, True, BLOCK, **options
-        )
+        _march[(num_rays,)](*arguments, offsets, starts, ends, ray_indices, *occupancy.shape, True, BLOCK, **options)
     return starts, ends, ray_indices, offsets
 
 

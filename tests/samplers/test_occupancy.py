@@ -1,0 +1,143 @@
+"""Occupancy-guided sampling: empty space is skipped, matter never is, and lost matter comes back."""
+
+import math
+
+import pytest
+import torch
+from reference import FormulaField, fog, rays_towards_origin
+from torch import Tensor
+
+from dnerf.compositing import FieldOutput, composite
+from dnerf.fields import RadianceField
+from dnerf.samplers import OccupancySampler, Sampler
+
+BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
+
+
+class MovingBall(RadianceField):
+    """A ball of radius 0.2 and density 50 that moves along x from -0.6 to 0.6."""
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        center = torch.stack([1.2 * times - 0.6, 0 * times, 0 * times], -1)
+        return 50.0 * ((positions - center).norm(dim=-1) < 0.2)
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        return FieldOutput(self.density(positions, times), torch.ones_like(positions))
+
+
+def small(**options: object) -> OccupancySampler:
+    return OccupancySampler(BOX, 0.02, 16, **{"num_slabs": 8, "num_probes": 4096, **options})
+
+
+def opacity(sampler: Sampler, field: RadianceField) -> tuple[Tensor, int]:
+    """Opacities of a hundred rays, and the number of samples they took."""
+    rays = rays_towards_origin(100)
+    samples = sampler.eval()(rays, field)
+    output = field(samples.positions(rays), samples.per_sample(rays.directions), samples.per_sample(rays.times))
+    return composite(samples, output).opacity, samples.starts.numel()
+
+
+def test_a_filled_grid_gives_the_same_picture_with_fewer_samples() -> None:
+    everything, guided = small(), small()
+    guided.fill(MovingBall())
+    (exact, many), (fast, few) = opacity(everything, MovingBall()), opacity(guided, MovingBall())
+    assert exact.max() > 0.9
+    torch.testing.assert_close(fast, exact, rtol=0, atol=1e-5)
+    assert few < 0.3 * many
+
+
+def test_matter_is_looked_for_at_the_time_of_its_ray() -> None:
+    """The slab of a time knows where the ball is then, not where it ever is."""
+    sampler = small(margin=0)
+    sampler.fill(MovingBall())
+    first, last = sampler.occupied[0].any(-1).any(-1), sampler.occupied[-1].any(-1).any(-1)
+    assert first[:5].any()
+    assert not first[10:].any()
+    assert last[11:].any()
+    assert not last[:6].any()
+
+
+def test_occupied_cells_are_widened_by_one_cell_and_one_slab() -> None:
+    sampler = small()
+    sampler.maxima.zero_()
+    sampler.maxima[3, 7, 8, 0] = 100.0
+    sampler._decide()
+    slabs, x, y, z = (sampler.occupied.nonzero()[:, axis].unique().tolist() for axis in range(4))
+    assert (slabs, x, y, z) == ([2, 3, 4], [6, 7, 8], [7, 8, 9], [0, 1])
+    assert sampler.occupied.sum() == 3 * 3 * 3 * 2
+
+
+def test_a_thin_uniform_start_empties_nothing() -> None:
+    sampler = small()
+    for step in range(0, 641, 16):
+        sampler.update(fog(1e-2), step)
+    assert sampler.occupied.all()
+
+
+def test_updates_drop_empty_space_and_keep_matter() -> None:
+    sampler = small(num_probes=1 << 15)
+    for step in range(0, 641, 16):
+        sampler.update(MovingBall(), step)
+    exact, many = opacity(small(), MovingBall())
+    guided, few = opacity(sampler, MovingBall())
+    assert few < 0.6 * many
+    torch.testing.assert_close(guided, exact, rtol=0, atol=1e-2)
+
+
+def test_lost_matter_comes_back() -> None:
+    sampler = small(num_probes=1 << 16)
+    sampler.fill(FormulaField(lambda x: 50.0 * (x[..., 0] < -0.8), lambda x, d, t: x))
+    assert opacity(sampler, MovingBall())[0].max() < 0.9
+    for step in range(16, 321, 16):
+        sampler.update(MovingBall(), step)
+    torch.testing.assert_close(opacity(sampler, MovingBall())[0], opacity(small(), MovingBall())[0], rtol=0, atol=1e-2)
+
+
+def test_updates_only_happen_at_their_steps() -> None:
+    sampler = small()
+    before = sampler.maxima.clone()
+    for step in (0, 1, 15, 17):
+        sampler.update(MovingBall(), step)
+    assert torch.equal(sampler.maxima, before)
+    sampler.update(MovingBall(), 16)
+    assert not torch.equal(sampler.maxima, before)
+
+
+def test_training_samples_raise_the_maxima_of_their_own_cells() -> None:
+    sampler = small().train()
+    rays = rays_towards_origin(50)
+    samples = sampler(rays, fog(), generator=torch.Generator().manual_seed(0))
+    density = torch.rand(samples.starts.shape) * 100
+    expected = sampler.maxima.clone()
+    positions, times = samples.positions(rays), samples.per_sample(rays.times)
+    for (x, y, z), t, value in zip(positions.tolist(), times.tolist(), density.tolist()):
+        cell = [min(max(math.floor(8 * t), 0), 7), *(min(max(math.floor(8 * (c + 1)), 0), 15) for c in (x, y, z))]
+        expected[tuple(cell)] = max(expected[tuple(cell)].item(), value)
+    sampler.observe(rays, samples, FieldOutput(density, torch.zeros(len(density), 3)))
+    # A position on a cell's face may round to either side.
+    assert (sampler.maxima != expected).sum() <= 4
+    assert (sampler.maxima > 50).sum() > 100
+
+
+def test_grid_is_saved_with_the_model() -> None:
+    sampler, loaded = small(), small()
+    sampler.fill(MovingBall())
+    loaded.load_state_dict(sampler.state_dict())
+    assert torch.equal(loaded.occupied, sampler.occupied)
+    assert torch.equal(loaded.maxima, sampler.maxima)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_slabs": 0}, "num_slabs must be > 0"),
+        ({"num_probes": 0}, "num_probes must be > 0"),
+        ({"update_every": 0}, "update_every must be > 0"),
+        ({"threshold": 0.0}, "threshold must be > 0"),
+        ({"decay": 1.0}, r"decay must be in \(0, 1\)"),
+        ({"margin": 2}, "margin must be 0 or 1"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        small(**options)

@@ -1,0 +1,99 @@
+"""Motions: poses compose, invert, follow their formulas and their velocities."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.geometry import so3_exp
+from dnerf.scenes import Fixed, Joint, Motion, Orbit, Pulse, Slide, Spin, Wave
+from dnerf.scenes.poses import Pose, turn
+
+CHAIN = Joint(
+    Joint(Slide(Orbit(0.5, 2.0, 0.1, 0.3)), (0.1, 0.2, 0.3), (0.0, 1.0, 0.0), Wave(0.1, ((0.7, 1.0, 0.2),))),
+    (0.0, 0.0, -0.4),
+    (1.0, 0.0, 0.0),
+    Wave(0.2, ((0.4, 2.0, 0.0), (0.1, 3.0, 0.5))),
+)
+MOTIONS: list[Motion] = [
+    Fixed((0.1, 0.2, 0.3), (0.3, -0.2, 0.5)),
+    Orbit(0.7, -1.0, 0.3, 0.4, (0.1, 0.0, -0.1)),
+    Spin(Fixed((0.5, 0.0, 0.0)), (0.0, 0.0, 1.0), 2.0),
+    Slide(distance=Wave(0.1, ((0.2, 1.0, 0.0),))),
+    Pulse(Fixed((0.0, 0.3, 0.0)), Wave(1.0, ((0.3, 1.0, 0.25),))),
+    CHAIN,
+]
+
+
+def times_and_points(count: int = 64) -> tuple[Tensor, Tensor]:
+    return torch.rand(count, dtype=torch.float64), torch.randn(count, 3, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda m: type(m).__name__)
+def test_local_and_world_are_inverse_and_rigid_up_to_scale(motion: Motion) -> None:
+    times, points = times_and_points()
+    pose = motion.pose(times)
+    torch.testing.assert_close(pose.to_local(pose.to_world(points)), points, rtol=0, atol=1e-14)
+    eye = torch.eye(3, dtype=torch.float64).expand(len(times), 3, 3)
+    torch.testing.assert_close(pose.rotation @ pose.rotation.mT, eye, rtol=0, atol=1e-14)
+    torch.testing.assert_close(pose.rotation.det(), torch.ones_like(times), rtol=0, atol=1e-14)
+    distance = (pose.to_world(points) - pose.translation).norm(dim=-1)
+    torch.testing.assert_close(distance, pose.scale * points.norm(dim=-1), rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda m: type(m).__name__)
+def test_each_time_has_its_own_pose(motion: Motion) -> None:
+    times, points = times_and_points(7)
+    together = motion.pose(times).to_world(points)
+    alone = torch.cat([motion.pose(times[i : i + 1]).to_world(points[i : i + 1]) for i in range(7)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda m: type(m).__name__)
+def test_whole_cycles_close(motion: Motion) -> None:
+    points = torch.randn(5, 3, dtype=torch.float64)
+    start, end = (motion.pose(torch.full((5,), t, dtype=torch.float64)).to_world(points) for t in (0.0, 1.0))
+    torch.testing.assert_close(start, end, rtol=0, atol=1e-14)
+
+
+def test_turn_is_the_exponential_of_its_axis() -> None:
+    angles = torch.tensor([0.0, 1e-9, 0.3, math.pi, -5.0], dtype=torch.float64)
+    axis = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    torch.testing.assert_close(turn((1.2, 0.0, 1.6), angles), so3_exp(angles[:, None] * axis), rtol=0, atol=1e-15)
+
+
+def test_orbit_keeps_radius_speed_and_orientation() -> None:
+    times = torch.linspace(0, 1, 101, dtype=torch.float64)
+    pose = Orbit(0.7, 2.0, 0.1, 0.5, (1.0, 2.0, 3.0)).pose(times)
+    offset = pose.translation - torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    torch.testing.assert_close(offset.norm(dim=-1), torch.full_like(times, 0.7))
+    steps = offset.diff(dim=0).norm(dim=-1)
+    torch.testing.assert_close(steps, torch.full_like(steps, 1.4 * math.sin(2 * math.pi * 0.01)))
+    assert (pose.rotation == torch.eye(3, dtype=torch.float64)).all()
+
+
+def test_joint_turns_about_its_own_point() -> None:
+    pose = Joint(Fixed(), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), Wave(0.5 * math.pi)).pose(torch.zeros(1).double())
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
+    expected = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 1.0]], dtype=torch.float64)
+    torch.testing.assert_close(pose.to_world(points), expected, rtol=0, atol=1e-15)
+
+
+def test_poses_compose_like_functions() -> None:
+    times, points = times_and_points()
+    outer, inner = MOTIONS[4].pose(times), CHAIN.pose(times)
+    torch.testing.assert_close(
+        outer.then(inner).to_world(points), outer.to_world(inner.to_world(points)), rtol=0, atol=1e-14
+    )
+
+
+def test_wave_is_its_formula() -> None:
+    value = Wave(0.5, ((2.0, 1.0, 0.25), (1.0, 3.0, 0.0)))(torch.tensor([0.1], dtype=torch.float64))
+    truth = 0.5 + 2 * math.sin(2 * math.pi * 0.35) + math.sin(2 * math.pi * 0.3)
+    assert value.item() == pytest.approx(truth, abs=1e-15)
+
+
+def test_identity_pose_changes_nothing() -> None:
+    times, points = times_and_points()
+    assert torch.equal(Pose.identity(times).to_world(points), points)
