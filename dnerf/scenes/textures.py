@@ -105,8 +105,8 @@ class Checker(Texture):
     """Two textures in turn: every plane crossed changes from one to the other.
 
     Args:
-        first: on the back of an even number of planes' fronts.
-        second: where a point lies in front of an odd number of planes.
+        first: where a point lies in front of an even number of planes.
+        second: where the number is odd.
         planes: (normal, offset) each; a point is in front where normal . x > offset.
     """
 
