@@ -131,7 +131,14 @@ class Samples:
 
     def positions(self, rays: Rays) -> Tensor:
         """World positions at which the field is evaluated, (R, S, 3) or (N, 3)."""
-        return torch.addcmul(self.per_sample(rays.origins), self.distances[..., None], self.per_sample(rays.directions))
+        return self.locate(rays)[0]
+
+    def locate(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions (..., 3), directions (..., 3) and times (...,) of the samples, (R, S) or (N,)."""
+        # One gather of seven columns is several times quicker than three of one to three.
+        rows = self.per_sample(torch.cat([rays.origins, rays.directions, rays.times[:, None]], dim=-1))
+        directions = rows[..., 3:6]
+        return torch.addcmul(rows[..., :3], self.distances[..., None], directions), directions, rows[..., 6]
 
     def packed(self, mask: Tensor | None = None) -> "Samples":
         """Return dense samples as packed ones, only those where `mask` (R, S) holds (all if None)."""

@@ -51,7 +51,7 @@ class Renderer(nn.Module):
         return next(chain(self.parameters(), self.buffers())).device
 
     def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Rendering:
-        """Render R rays.
+        """Render R rays; in training mode the sampler also learns from what the field says.
 
         Args:
             rays: R rays.
@@ -59,8 +59,10 @@ class Renderer(nn.Module):
         """
         with self._autocast(rays.origins.device):
             samples = self.sampler(rays, self.field, generator=generator)
-            directions = samples.per_sample(rays.directions)
-            output = self.field(samples.positions(rays), directions, samples.per_sample(rays.times))
+            positions, directions, times = samples.locate(rays)
+            output = self.field(positions, directions, times)
+        if self.training:
+            self.sampler.observe(positions.detach(), times, output.density.detach())
         background = self.background(rays.directions, generator=generator)
         rendering = composite(samples, output, background)
         if not samples.proposals:

@@ -202,7 +202,6 @@ class Trainer:
         rendering = renderer(rays, generator=generator)
         assert rendering.background is not None
         assert rendering.samples is not None
-        assert rendering.output is not None
         target = composite_on(rgba, rendering.background)
         terms = {name: loss(rendering, target, renderer) for name, loss in self.losses.items()}
         total = torch.stack(list(terms.values())).sum()
@@ -210,7 +209,6 @@ class Trainer:
         if total.requires_grad:
             total.backward()
             optimizer.step()
-        renderer.sampler.observe(rays, rendering.samples, rendering.output)
         mse = (rendering.rgb.detach() - target).square().mean()
         detached = {name: term.detach() for name, term in terms.items()}
         return {"loss": total.detach(), **detached}, rendering.samples.starts.numel(), mse

@@ -56,7 +56,7 @@ def render_exact(
     for i in range(0, len(rays), chunk):
         part = rays[i : i + chunk]
         samples = scene.exact_samples(part)
-        output = scene(samples.positions(part), samples.per_sample(part.directions), samples.per_sample(part.times))
+        output = scene(*samples.locate(part))
         parts.append(composite(samples, output, background))
     return (
         torch.cat([p.rgb for p in parts]),

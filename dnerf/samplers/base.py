@@ -3,9 +3,8 @@
 from abc import ABC, abstractmethod
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from dnerf.compositing import FieldOutput
 from dnerf.fields.base import RadianceField
 from dnerf.rays import Rays, Samples
 
@@ -31,11 +30,11 @@ class Sampler(nn.Module, ABC):
             step: number of training steps done so far.
         """
 
-    def observe(self, rays: Rays, samples: Samples, output: FieldOutput) -> None:
+    def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:  # noqa: B027 - as above
         """Learn from what the field said at the samples of a training step; does nothing unless overridden.
 
         Args:
-            rays: the step's rays.
-            samples: where they were sampled.
-            output: the field's output there.
+            positions: (..., 3) of the samples, in world units.
+            times: (...,) of the samples.
+            density: (...,) that the field said there.
         """

@@ -58,9 +58,9 @@ class ImportanceSampler(Sampler):
     def _coarse_pass(
         self, rays: Rays, coarse: Samples, field: RadianceField
     ) -> tuple[Tensor, tuple[tuple[Samples, FieldOutput], ...]]:
-        positions, times = coarse.positions(rays), coarse.per_sample(rays.times)
+        positions, directions, times = coarse.locate(rays)
         if self.proposal is None:
             with torch.no_grad():
                 return field.density(positions, times), ()
-        output = self.proposal(positions, coarse.per_sample(rays.directions), times)
+        output = self.proposal(positions, directions, times)
         return output.density, ((coarse, output),)

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool3d
 
 from dnerf.checks import as_box, check_positive
-from dnerf.compositing import FieldOutput
 from dnerf.fields.base import RadianceField
-from dnerf.kernels import march, skip_distances
+from dnerf.kernels import MarchedSamples, march, skip_distances
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 
@@ -38,6 +36,8 @@ class OccupancySampler(Sampler):
         update_every: training steps between updates.
         num_probes: random cells asked at each update.
         margin: cells by which occupied regions are widened in space (0 or 1); time is widened by one slab.
+        pad_to: the number of samples is rounded up to a multiple of this by intervals of length zero, since matrix
+            libraries compile code for every new number of rows (1 for no padding).
 
     Raises:
         ValueError: for numbers out of range.
@@ -55,6 +55,7 @@ class OccupancySampler(Sampler):
         update_every: int = 16,
         num_probes: int = 1 << 16,
         margin: int = 1,
+        pad_to: int = 2048,
     ) -> None:
         super().__init__()
         for name, value in (
@@ -64,6 +65,7 @@ class OccupancySampler(Sampler):
             ("threshold", threshold),
             ("update_every", update_every),
             ("num_probes", num_probes),
+            ("pad_to", pad_to),
         ):
             check_positive(name, value)
         if not 0 < decay < 1:
@@ -79,13 +81,16 @@ class OccupancySampler(Sampler):
         self.update_every = update_every
         self.num_probes = num_probes
         self.margin = margin
+        self.pad_to = pad_to
         self.register_buffer("box", corners, persistent=False)
         self.register_buffer("shape", torch.tensor([num_slabs, *cells]), persistent=False)
+        self.register_buffer("strides", torch.tensor(torch.empty(num_slabs, *cells).stride()), persistent=False)
         self.register_buffer("maxima", torch.full((num_slabs, *cells), float(threshold)))
         self.register_buffer("occupied", torch.ones((num_slabs, *cells), dtype=torch.bool))
         self.register_buffer("skips", skip_distances(self.occupied))
         self.box: Tensor
         self.shape: Tensor
+        self.strides: Tensor
         self.skips: Tensor
         self.maxima: Tensor
         self.occupied: Tensor
@@ -107,23 +112,28 @@ class OccupancySampler(Sampler):
             step=self.step_size,
             skips=self.skips,
         )
-        return Samples(
-            marched.starts,
-            marched.ends,
-            len(rays),
-            ray_indices=marched.ray_indices,
-            ray_offsets=marched.offsets,
-        )
+        return self._padded(marched, len(rays))
+
+    def _padded(self, marched: MarchedSamples, num_rays: int) -> Samples:
+        """Add intervals of length zero after the last one, up to a multiple of `pad_to`."""
+        starts, ends, ray_indices, offsets = marched
+        count = len(starts)
+        padding = -count % self.pad_to if count else 0
+        if padding:
+            last = ends[-1:].expand(padding)
+            starts, ends = torch.cat([starts, last]), torch.cat([ends, last])
+            ray_indices = torch.cat([ray_indices, ray_indices[-1:].expand(padding)])
+            offsets = offsets + padding * (offsets == count)
+        return Samples(starts, ends, num_rays, ray_indices=ray_indices, ray_offsets=offsets)
 
     @torch.no_grad()
-    def observe(self, rays: Rays, samples: Samples, output: FieldOutput) -> None:
-        """Enter the densities of the training samples into the grid."""
-        unit = (samples.positions(rays) - self.box[0]) / (self.box[1] - self.box[0])
-        cells = torch.cat([samples.per_sample(rays.times)[:, None], unit], dim=-1) * self.shape
-        slab, x, y, z = torch.minimum(cells.long().clamp(min=0), self.shape - 1).unbind(-1)
-        _, size_x, size_y, size_z = self.maxima.shape
-        flat = ((slab * size_x + x) * size_y + y) * size_z + z
-        self.maxima.view(-1).scatter_reduce_(0, flat, output.density.to(self.maxima.dtype), "amax")
+    def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:
+        """Enter the densities of training samples, all (N, ...), into the grid."""
+        unit = (positions - self.box[0]) / (self.box[1] - self.box[0])
+        cells = torch.cat([times[:, None], unit], dim=-1) * self.shape
+        cells = torch.minimum(cells.long().clamp_(min=0), self.shape - 1)
+        flat = (cells * self.strides).sum(-1)
+        self.maxima.view(-1).scatter_reduce_(0, flat, density.to(self.maxima.dtype), "amax")
 
     @torch.no_grad()
     def update(self, field: RadianceField, step: int) -> None:
@@ -166,10 +176,15 @@ class OccupancySampler(Sampler):
 
     def _decide(self) -> None:
         threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
-        occupied = self.maxima > threshold
-        if self.margin:
-            occupied = max_pool3d(occupied[:, None].float(), 3, stride=1, padding=1)[:, 0] > 0
-        self.occupied.copy_(occupied)
-        self.occupied[1:] |= occupied[:-1]
-        self.occupied[:-1] |= occupied[1:]
+        self.occupied.copy_(self.maxima > threshold)
+        for axis in range(4 if self.margin else 1):
+            self.occupied.copy_(_widened(self.occupied, axis))
         self.skips.copy_(skip_distances(self.occupied))
+
+
+def _widened(mask: Tensor, axis: int) -> Tensor:
+    """A mask and its neighbours on both sides along one axis."""
+    result, size = mask.clone(), mask.shape[axis] - 1
+    result.narrow(axis, 1, size).logical_or_(mask.narrow(axis, 0, size))
+    result.narrow(axis, 0, size).logical_or_(mask.narrow(axis, 1, size))
+    return result

@@ -28,9 +28,13 @@ def num_threads() -> int:
 
 def launch(kernel: Callable[..., Any], *arguments: Any) -> None:
     """Run a parallel numba kernel on `num_threads()` threads; safe from several Python threads at once."""
-    numba.set_num_threads(num_threads())
+    threads = num_threads()
+    numba.set_num_threads(threads)
     with _turn():
         kernel(*arguments)
+    # Starting its OpenMP pool, numba also sets the number of threads that torch goes by.
+    if torch.get_num_threads() != threads and threads < numba.config.NUMBA_NUM_THREADS:
+        torch.set_num_threads(threads)
 
 
 @cache
