@@ -8,6 +8,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from dnerf.checks import check_positive
 from dnerf.data.frames import Frames
 from dnerf.metrics import psnr, ssim
 from dnerf.renderer import Renderer
@@ -66,9 +67,10 @@ def evaluate(
     split: str = "test",
     *,
     chunk: int = 16384,
+    max_frames: int | None = None,
     on_frame: FrameCallback | None = None,
 ) -> Evaluation:
-    """Render every frame and compare it with the truth on the renderer's own (evaluation) background.
+    """Render frames and compare them with the truth on the renderer's own (evaluation) background.
 
     Pictures are compared as floats in [0, 1]: predictions clamped, truths as stored in 8 bits.
 
@@ -77,6 +79,7 @@ def evaluate(
         frames: the split's frames.
         split: its name, for the report.
         chunk: rays rendered at a time.
+        max_frames: score at most so many, spread evenly over the split; None scores all.
         on_frame: called with score, prediction (H, W, 3) and truth (H, W, 3) of every frame.
     """
     device = renderer.device
@@ -85,7 +88,7 @@ def evaluate(
     renderer.eval()
     background = renderer.background(torch.zeros(1, 3, device=device))[0]
     scores, seconds = [], 0.0
-    for i in range(len(frames)):
+    for i in spread_indices(len(frames), max_frames):
         camera, moment = frames.camera(i), float(frames.times[i])
         begin = time.perf_counter()
         prediction = renderer.render_image(camera, moment, chunk=chunk).rgb.clamp(0, 1)
@@ -106,3 +109,15 @@ def evaluate(
         seconds_per_frame=seconds / len(scores),
         frames=scores,
     )
+
+
+def spread_indices(count: int, most: int | None) -> list[int]:
+    """At most `most` of the indices below `count`, from first to last at even distances; all if None.
+
+    Raises:
+        ValueError: if `most` is not positive.
+    """
+    if most is None or most >= count:
+        return list(range(count))
+    check_positive("max_frames", most)
+    return [round(k * (count - 1) / max(most - 1, 1)) for k in range(most)]

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import dnerf
+from dnerf.allocator import keep_freed_memory
 from dnerf.checkpoints import load_weights
 from dnerf.files import write_text
 from dnerf.renderer import Renderer
@@ -29,9 +30,10 @@ CONF = str(Path(__file__).resolve().parents[1] / "conf")
 def run_app(main: Callable[[DictConfig], None], config_name: str) -> None:
     """Run a Hydra application; what the user got wrong ends in one line on standard error and exit code 2.
 
-    Set DNERF_TRACEBACK=1 to see the whole traceback instead.
+    Also sets the C allocator to keep memory between steps. Set DNERF_TRACEBACK=1 to see the whole traceback instead.
     """
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    keep_freed_memory()
     application = hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(main)
     try:
         application()

@@ -6,7 +6,7 @@ from pathlib import Path
 from torch import Tensor
 
 from dnerf.data import DataSource
-from dnerf.evaluation import FrameScore, evaluate
+from dnerf.evaluation import FrameScore, evaluate, spread_indices
 from dnerf.files import write_json
 from dnerf.logs import SHEET_COLUMNS
 from dnerf.renderer import Renderer
@@ -15,15 +15,18 @@ from dnerf.video import contact_sheet, error_map, write_png
 MAX_ROWS = 4
 
 
-def evaluate_run(folder: Path, renderer: Renderer, data: DataSource, split: str) -> dict[str, object]:
-    """Score a run on a split; write `metrics.json` and `contact_sheet_<split>.png` into its folder.
+def evaluate_run(
+    folder: Path, renderer: Renderer, data: DataSource, split: str, max_frames: int | None = None
+) -> dict[str, object]:
+    """Score a run on a split, or on so many of its frames; write `metrics.json` and a contact sheet into its folder.
 
     Raises:
         ValueError: if `training.json` is missing or broken.
     """
     training = read_training(folder)
     frames = data.frames(split)
-    shown = {round(k * (len(frames) - 1) / max(MAX_ROWS - 1, 1)) for k in range(MAX_ROWS)}
+    scored = spread_indices(len(frames), max_frames)
+    shown = {scored[k] for k in spread_indices(len(scored), MAX_ROWS)}
     rows: list[list[Tensor]] = []
     labels: list[str] = []
 
@@ -32,7 +35,7 @@ def evaluate_run(folder: Path, renderer: Renderer, data: DataSource, split: str)
             rows.append([prediction, truth, error_map(prediction, truth)])
             labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")
 
-    metrics = {**evaluate(renderer, frames, split, on_frame=keep).as_dict(), **training}
+    metrics = {**evaluate(renderer, frames, split, max_frames=max_frames, on_frame=keep).as_dict(), **training}
     write_png(contact_sheet(rows, columns=SHEET_COLUMNS, rows=labels), sheet_path(folder, split))
     write_json(folder / "metrics.json", metrics)
     return metrics

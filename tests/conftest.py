@@ -1,8 +1,15 @@
 """What all tests share: reproducible hypothesis runs without a deadline (compiled kernels are slow the first time)."""
 
+import os
+
 import pytest
 import torch
 from hypothesis import settings
+
+# Triton reads this when it is imported, by whichever test comes first: without a GPU its kernels run in the
+# interpreter, on CPU tensors.
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"
 
 settings.register_profile("dnerf", derandomize=True, deadline=None, max_examples=50)
 settings.load_profile("dnerf")

@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "dnerf"
 
 FLOORS = {
     # 0: knows nothing of rendering. `checks`, `files` and `mlp` serve every floor and need none.
+    "allocator": 0,
     "checks": 0,
     "encodings": 0,
     "files": 0,

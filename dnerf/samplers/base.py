@@ -30,7 +30,7 @@ class Sampler(nn.Module, ABC):
             step: number of training steps done so far.
         """
 
-    def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:  # noqa: B027 - as above
+    def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:
         """Learn from what the field said at the samples of a training step; does nothing unless overridden.
 
         Args:

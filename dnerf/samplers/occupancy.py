@@ -85,7 +85,7 @@ class OccupancySampler(Sampler):
         self.register_buffer("box", corners, persistent=False)
         self.register_buffer("shape", torch.tensor([num_slabs, *cells]), persistent=False)
         self.register_buffer("strides", torch.tensor(torch.empty(num_slabs, *cells).stride()), persistent=False)
-        self.register_buffer("maxima", torch.full((num_slabs, *cells), float(threshold)))
+        self.register_buffer("maxima", torch.full((num_slabs, *cells), NEGLIGIBLE * 1e-3))
         self.register_buffer("occupied", torch.ones((num_slabs, *cells), dtype=torch.bool))
         self.register_buffer("skips", skip_distances(self.occupied))
         self.box: Tensor

@@ -1,12 +1,5 @@
-import os
-import sys
-
 import pytest
 import torch
-
-# Triton reads this when it is imported: without a GPU its kernels run in the interpreter, on CPU tensors.
-if not torch.cuda.is_available() and "triton" not in sys.modules:
-    os.environ["TRITON_INTERPRET"] = "1"
 
 from dnerf import kernels
 

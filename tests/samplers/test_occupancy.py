@@ -9,6 +9,8 @@ from torch import Tensor
 
 from dnerf.compositing import FieldOutput, composite
 from dnerf.fields import RadianceField
+from dnerf.kernels import skip_distances
+from dnerf.rays import Rays
 from dnerf.samplers import OccupancySampler, Sampler
 
 BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
@@ -26,7 +28,7 @@ class MovingBall(RadianceField):
 
 
 def small(**options: object) -> OccupancySampler:
-    return OccupancySampler(BOX, 0.02, 16, **{"num_slabs": 8, "num_probes": 4096, **options})
+    return OccupancySampler(BOX, 0.02, 16, **{"num_slabs": 8, "num_probes": 4096, "pad_to": 1, **options})
 
 
 def opacity(sampler: Sampler, field: RadianceField) -> tuple[Tensor, int]:
@@ -113,7 +115,7 @@ def test_training_samples_raise_the_maxima_of_their_own_cells() -> None:
     for (x, y, z), t, value in zip(positions.tolist(), times.tolist(), density.tolist()):
         cell = [min(max(math.floor(8 * t), 0), 7), *(min(max(math.floor(8 * (c + 1)), 0), 15) for c in (x, y, z))]
         expected[tuple(cell)] = max(expected[tuple(cell)].item(), value)
-    sampler.observe(rays, samples, FieldOutput(density, torch.zeros(len(density), 3)))
+    sampler.observe(positions, times, density)
     # A position on a cell's face may round to either side.
     assert (sampler.maxima != expected).sum() <= 4
     assert (sampler.maxima > 50).sum() > 100
@@ -141,3 +143,37 @@ def test_grid_is_saved_with_the_model() -> None:
 def test_numbers_out_of_range_are_refused(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         small(**options)
+
+
+def test_padding_rounds_the_number_of_samples_up_and_changes_no_picture() -> None:
+    plain, padded = small(), small(pad_to=512)
+    for sampler in (plain, padded):
+        sampler.fill(MovingBall())
+        sampler.eval()
+    rays = rays_towards_origin(40)
+    # The last rays miss everything, so that padding must go to a ray before them.
+    rays = Rays(
+        rays.origins,
+        torch.cat([rays.directions[:30], -rays.directions[30:]]),
+        rays.times,
+        rays.near,
+        rays.far,
+    )
+    field = MovingBall()
+    pictures = []
+    for sampler in (plain, padded):
+        samples = sampler(rays, field)
+        counted = torch.bincount(samples.ray_indices, minlength=len(rays))
+        assert torch.equal(samples.offsets.diff(), counted)
+        pictures.append((len(samples.starts), composite(samples, field(*samples.locate(rays)))))
+    assert pictures[0][0] % 512 != 0
+    assert pictures[1][0] == pictures[0][0] + (-pictures[0][0] % 512)
+    assert torch.equal(pictures[0][1].opacity, pictures[1][1].opacity)
+    assert torch.equal(pictures[0][1].rgb, pictures[1][1].rgb)
+
+
+def test_nothing_is_not_padded() -> None:
+    sampler = small(pad_to=512)
+    sampler.occupied.fill_(False)
+    sampler.skips.copy_(skip_distances(sampler.occupied))
+    assert sampler.eval()(rays_towards_origin(5), MovingBall()).starts.shape == (0,)

@@ -153,8 +153,10 @@ def test_rays_do_not_see_each_other(name: str) -> None:
     together = intervals(sample(name, rays))
     backward = intervals(sample(name, rays[torch.arange(11, -1, -1)]))
     for r in range(12):
-        alone = intervals(sample(name, rays[r : r + 1]))[0]
-        for row in (together[r], backward[11 - r]):
+        # Padding by intervals of length zero, which add nothing, may go to any ray.
+        alone = [i for i in intervals(sample(name, rays[r : r + 1]))[0] if i.end > i.start]
+        for given in (together[r], backward[11 - r]):
+            row = [i for i in given if i.end > i.start]
             assert len(row) == len(alone)
             for a, b in zip(row, alone):
                 assert (a.start, a.end, a.point) == pytest.approx((b.start, b.end, b.point), rel=1e-12)
