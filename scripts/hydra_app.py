@@ -3,8 +3,8 @@
 import importlib
 import os
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,15 @@ def run_app(main: Callable[[DictConfig], None], config_name: str) -> None:
     """
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     keep_freed_memory()
-    application = hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(main)
+    with _one_line_errors():
+        hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(_one_line_errors()(main))()
+
+
+@contextmanager
+def _one_line_errors() -> Iterator[None]:
+    """Leave with one line and exit code 2 on what the user got wrong (within a job, before Hydra adds lines)."""
     try:
-        application()
+        yield
     except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
         if os.environ.get("DNERF_TRACEBACK") == "1":
             raise

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from dnerf.backgrounds import parse_color
-from dnerf.checks import as_box, check_choice
+from dnerf.checks import as_box, check_choice, check_positive
 from dnerf.data.blender import load_blender
 from dnerf.data.frames import Frames
 from dnerf.data.synthetic import random_views, render_frames
@@ -80,6 +80,9 @@ class SyntheticData(DataSource):
         num_test: frames of the test split.
         seed: of the random views.
         background: colour behind the frames, which have no alpha then; None keeps alpha.
+
+    Raises:
+        ValueError: if resolution or a number of frames is not positive, or the box or colour is none.
     """
 
     def __init__(
@@ -94,6 +97,13 @@ class SyntheticData(DataSource):
         seed: int = 0,
         background: str | Sequence[float] | None = None,
     ) -> None:
+        for name, value in (
+            ("resolution", resolution),
+            ("num_train", num_train),
+            ("num_val", num_val),
+            ("num_test", num_test),
+        ):
+            check_positive(name, value)
         self.scene = scene
         self.resolution = resolution
         self.box = as_box(box)
