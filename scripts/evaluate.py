@@ -14,7 +14,17 @@ def main(config: DictConfig) -> None:
         saved.data.root = config.data_root
     renderer = load_renderer(config.run, saved, resolve_device(config.device))
     folder = Path(config.run)
-    print_scores(evaluate_run(folder, renderer, build(saved.data), config.split, config.max_frames), folder)
+    print_scores(
+        evaluate_run(
+            folder,
+            renderer,
+            build(saved.data),
+            config.split,
+            max_frames=config.max_frames,
+            chunk=config.chunk or saved.chunk,
+        ),
+        folder,
+    )
 
 
 if __name__ == "__main__":

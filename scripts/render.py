@@ -32,22 +32,21 @@ def main(config: DictConfig) -> None:
     times = _times(config.time, len(poses), own_times)
     suffix = "" if config.format == "png" else f".{config.format}"
     output = Path(config.output or Path(config.run) / "renders" / f"{config.path.name}{suffix}")
-    pictures = _pictures(renderer, frames, poses.to(device), times, config)
+    pictures = _pictures(renderer, frames, poses.to(device), times, config.resolution, config.chunk or saved.chunk)
     write_frames(tqdm(pictures, total=len(poses), unit="frame"), output, config.format, fps=config.fps)
     print(f"{len(poses)} frames: {output}")
 
 
 def _pictures(
-    renderer: Renderer, frames: Frames, poses: Tensor, times: list[float], config: DictConfig
+    renderer: Renderer, frames: Frames, poses: Tensor, times: list[float], resolution: int | None, chunk: int
 ) -> Iterator[Tensor]:
     intrinsics = frames.intrinsics
-    if config.resolution is not None:
-        check_positive("resolution", config.resolution)
-        height = round(config.resolution * intrinsics.height / intrinsics.width)
-        intrinsics = intrinsics.resized(config.resolution, height)
+    if resolution is not None:
+        check_positive("resolution", resolution)
+        intrinsics = intrinsics.resized(resolution, round(resolution * intrinsics.height / intrinsics.width))
     for pose, time in zip(poses, times):
         camera = Camera(intrinsics, pose, frames.near, frames.far)
-        yield to_uint8(renderer.render_image(camera, time, chunk=config.chunk).rgb)
+        yield to_uint8(renderer.render_image(camera, time, chunk=chunk).rgb)
 
 
 def _poses(config: DictConfig, frames: Frames) -> tuple[Tensor, list[float] | None]:

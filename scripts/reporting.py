@@ -16,7 +16,13 @@ MAX_ROWS = 4
 
 
 def evaluate_run(
-    folder: Path, renderer: Renderer, data: DataSource, split: str, max_frames: int | None = None
+    folder: Path,
+    renderer: Renderer,
+    data: DataSource,
+    split: str,
+    *,
+    max_frames: int | None = None,
+    chunk: int = 16384,
 ) -> dict[str, object]:
     """Score a run on a split, or on so many of its frames; write `metrics.json` and a contact sheet into its folder.
 
@@ -35,7 +41,10 @@ def evaluate_run(
             rows.append([prediction, truth, error_map(prediction, truth)])
             labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")
 
-    metrics = {**evaluate(renderer, frames, split, max_frames=max_frames, on_frame=keep).as_dict(), **training}
+    metrics = {
+        **evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep).as_dict(),
+        **training,
+    }
     write_png(contact_sheet(rows, columns=SHEET_COLUMNS, rows=labels), sheet_path(folder, split))
     write_json(folder / "metrics.json", metrics)
     return metrics

@@ -39,7 +39,12 @@ def main(config: DictConfig) -> None:
     if with_writer is not None:
         with_writer.close()
     if config.evaluate_split is not None:
-        print_scores(evaluate_run(folder, renderer, data, config.evaluate_split, config.evaluate_frames), folder)
+        print_scores(
+            evaluate_run(
+                folder, renderer, data, config.evaluate_split, max_frames=config.evaluate_frames, chunk=config.chunk
+            ),
+            folder,
+        )
 
 
 def _callbacks(config: DictConfig, folder: Path, data: Any, writer: Any) -> list[Callable[..., None]]:
