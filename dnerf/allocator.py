@@ -11,7 +11,8 @@ M_MMAP_MAX = -4
 def keep_freed_memory() -> bool:
     """Tell glibc to keep freed memory for the next step instead of returning it; peak memory does not change.
 
-    A training step frees and takes the same few large blocks, so their page faults are wasted. Only glibc has these
+    A training step frees and takes the same few large blocks, so their page faults are wasted. How much time that
+    is depends on the machine: nothing measurable where faults are cheap. Only glibc has these
     settings; the environment variable DNERF_ALLOCATOR=default leaves them alone.
 
     Returns:

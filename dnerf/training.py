@@ -181,7 +181,10 @@ class Trainer:
         return record
 
     def _warm_up(self, renderer: Renderer, frames: Frames) -> None:
-        """Run every kernel once, forward and backward, so that their compilation is not timed; nothing is learnt."""
+        """Run every kernel once, forward and backward, so that their compilation is not timed.
+
+        No parameter changes; a sampler that observes sees the untrained field at a few points.
+        """
         generator = torch.Generator(frames.images.device).manual_seed(0)
         indices = torch.randint(frames.num_pixels, (64,), generator=generator, device=generator.device)
         loss = renderer(frames.pixels(indices)[0], generator=generator).rgb.sum()

@@ -19,9 +19,9 @@ class OccupancySampler(Sampler):
 
     Every cell of every slab keeps a decaying maximum of the densities seen in it: those of the training samples
     themselves (free) and of random probes of the field. A cell is occupied while it, or a neighbour in space or
-    time, is above the smaller of `threshold` and half the mean of all cells. So a thin start empties nothing
-    (uniform density is above half its mean), empty space is dropped as soon as matter stands out, and neighbours and
-    probes bring lost matter back.
+    time, is above the smaller of `threshold` and half the mean of all cells. So a thin start empties nothing that
+    was looked at (uniform density is above half its mean), empty space is dropped as soon as matter stands out, and
+    neighbours and probes bring back matter that was lost or lies where nobody has looked yet.
 
     Sources: instant-ngp (Mueller et al. 2022, appendix C) for the decaying maximum, nerfacc for a threshold that
     follows the mean; slabs in time and the use of training samples are this project's.
