@@ -10,6 +10,7 @@ from dnerf.fields.base import RadianceField
 from dnerf.kernels import MarchedSamples, march, skip_distances
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
+from dnerf.samplers.visibility import visible_samples
 
 NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no picture shows
 
@@ -55,6 +56,7 @@ class OccupancySampler(Sampler):
         update_every: int = 16,
         num_probes: int = 1 << 16,
         margin: int = 1,
+        min_weight: float = 0.0,
         pad_to: int = 2048,
     ) -> None:
         super().__init__()
@@ -81,6 +83,7 @@ class OccupancySampler(Sampler):
         self.update_every = update_every
         self.num_probes = num_probes
         self.margin = margin
+        self.min_weight = min_weight
         self.pad_to = pad_to
         self.register_buffer("box", corners, persistent=False)
         self.register_buffer("shape", torch.tensor([num_slabs, *cells]), persistent=False)
@@ -112,7 +115,19 @@ class OccupancySampler(Sampler):
             step=self.step_size,
             skips=self.skips,
         )
+        if self.min_weight > 0 and len(marched.starts):
+            marched = self._visible(marched, rays, field)
         return self._padded(marched, len(rays))
+
+    def _visible(self, marched: MarchedSamples, rays: Rays, field: RadianceField) -> MarchedSamples:
+        """Only the samples that can be seen."""
+        starts, ends, ray_indices, offsets = marched
+        samples = Samples(starts, ends, len(rays), ray_indices=ray_indices, ray_offsets=offsets)
+        observe = self.observe if self.training else None
+        marked = visible_samples(samples, rays, field, self.min_weight, pad_to=self.pad_to, observe=observe)
+        kept = marked.nonzero()[:, 0]
+        kept_before = torch.nn.functional.pad(marked.cumsum(0), (1, 0))
+        return MarchedSamples(starts[kept], ends[kept], ray_indices[kept], kept_before[offsets])
 
     def _padded(self, marched: MarchedSamples, num_rays: int) -> Samples:
         """Add intervals of length zero after the last one, up to a multiple of `pad_to`."""

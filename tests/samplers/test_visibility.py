@@ -1,0 +1,145 @@
+"""Only what can be seen is kept: nothing empty, nothing behind a surface, and the picture stays."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import FormulaField, fog, ray_weights, rays_towards_origin
+from torch import Tensor
+
+from dnerf.compositing import composite
+from dnerf.fields import RadianceField
+from dnerf.rays import Rays, Samples
+from dnerf.samplers import OccupancySampler
+from dnerf.samplers.visibility import visible_samples
+
+
+class CountingField(FormulaField):
+    """A field that remembers at how many points it was asked."""
+
+    num_points = 0
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        self.num_points += len(times)
+        return super().density(positions, times)
+
+
+def ball(density: float = 200.0) -> CountingField:
+    return CountingField(lambda x: density * (x.norm(dim=-1) < 0.9), lambda x, d, t: torch.sigmoid(3 * x))
+
+
+def packed(counts: list[int], length: float = 0.1) -> tuple[Rays, Samples]:
+    """Rays with so many intervals each, beginning at distance 0."""
+    num_rays = len(counts)
+    rays = Rays(
+        torch.zeros(num_rays, 3, dtype=torch.float64),
+        torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(num_rays, 3),
+        torch.linspace(0, 1, num_rays, dtype=torch.float64),
+        torch.zeros(num_rays, dtype=torch.float64),
+        torch.full((num_rays,), 100.0, dtype=torch.float64),
+    )
+    indices = torch.repeat_interleave(torch.tensor(counts))
+    ranks = torch.cat([torch.arange(c) for c in counts])
+    starts = ranks.double() * length
+    return rays, Samples(starts, starts + length, num_rays, ray_indices=indices)
+
+
+def table_field(samples: Samples, values: Tensor) -> RadianceField:
+    """A field on the x axis whose density at each sample's point and ray (by its time) is a given number."""
+    steps = max(samples.num_rays - 1, 1)
+    lookup = {
+        (int(ray), round(float(distance), 6)): float(value)
+        for ray, distance, value in zip(samples.ray_indices, samples.distances, values)
+    }
+
+    class Table(FormulaField):
+        def density(self, positions: Tensor, times: Tensor) -> Tensor:
+            keys = [(round(t * steps), round(x, 6)) for x, t in zip(positions[:, 0].tolist(), times.tolist())]
+            return positions.new_tensor([lookup[key] for key in keys])
+
+    return Table(lambda x: x[..., 0], lambda x, d, t: x)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.integers(0, 40), min_size=1, max_size=6).filter(any),
+    st.integers(0, 2**31),
+    st.sampled_from([1e-6, 1e-4, 1e-2]),
+    st.integers(1, 9),
+    st.sampled_from([1, 16]),
+)
+def test_marks_are_those_of_a_loop_over_all_weights(
+    counts: list[int], seed: int, min_weight: float, first_round: int, pad_to: int
+) -> None:
+    """Whatever the rounds: kept is what has weight and lies where light still arrives."""
+    rays, samples = packed(counts)
+    draw = torch.Generator().manual_seed(seed)
+    densities = 10 ** (torch.rand(sum(counts), generator=draw, dtype=torch.float64) * 8 - 5)
+    marked = visible_samples(
+        samples, rays, table_field(samples, densities), min_weight, first_round=first_round, pad_to=pad_to
+    )
+    expected = []
+    for values in densities.split(counts):
+        expected += [weight > min_weight for weight in ray_weights([0.1 * v for v in values.tolist()])]
+    assert marked.tolist() == expected
+
+
+@pytest.mark.parametrize("min_weight", [1e-2, 1e-3, 1e-4])
+def test_picture_changes_by_no_more_than_the_stated_bound(min_weight: float) -> None:
+    rays = rays_towards_origin(200)
+    field = FormulaField(lambda x: torch.exp(-20 * x.square().sum(-1)) * 60, lambda x, d, t: torch.sigmoid(3 * x))
+    box = [[-1.0] * 3, [1.0] * 3]
+    whole, culled = OccupancySampler(box, 0.02).eval(), OccupancySampler(box, 0.02, min_weight=min_weight).eval()
+    pictures, numbers = [], []
+    for sampler in (whole, culled):
+        samples = sampler(rays, field)
+        pictures.append(composite(samples, field(*samples.locate(rays)), torch.ones(3)).rgb)
+        numbers.append(int((samples.lengths > 0).sum()))
+    most_samples = math.ceil(2 * math.sqrt(3) / 0.02) + 1
+    assert (pictures[0] - pictures[1]).abs().max() <= min_weight * (most_samples + 1)
+    assert numbers[1] < 0.6 * numbers[0]
+
+
+def test_what_lies_behind_a_surface_is_not_even_asked() -> None:
+    rays = rays_towards_origin(64)
+    field = ball()
+    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-4, pad_to=1).eval()
+    samples = sampler(rays, field)
+    marched = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, pad_to=1).eval()(rays, field)
+    assert field.num_points < 0.5 * len(marched.starts)
+    # Density 200 over steps of 0.02: three intervals leave exp(-12) of the light.
+    inside = samples.positions(rays).norm(dim=-1) < 0.9
+    assert inside.all()
+    assert samples.offsets.diff().max() <= 3
+
+
+def test_a_thin_start_keeps_every_sample() -> None:
+    """Before training every sample has weight, and each must get a gradient."""
+    rays = rays_towards_origin(16)
+    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-4, pad_to=1).eval()
+    everything = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, pad_to=1).eval()
+    samples = everything(rays, fog(0.3))
+    # The box's edges may cut off a sliver too thin to weigh anything.
+    weighty = samples.starts[samples.lengths > 0.01]
+    assert torch.isin(weighty, sampler(rays, fog(0.3)).starts).all()
+
+
+def test_nothing_visible_leaves_no_samples() -> None:
+    rays = rays_towards_origin(16)
+    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-4).eval()
+    samples = sampler(rays, fog(0.0))
+    assert samples.starts.shape == (0,)
+    assert composite(samples, fog(0.0)(*samples.locate(rays)), torch.ones(3)).rgb.eq(1).all()
+
+
+@pytest.mark.parametrize("trained", [True, False])
+def test_occupancy_learns_from_the_samples_that_are_dropped(trained: bool) -> None:
+    """Only in training mode; the density of a dropped sample counts like that of a kept one."""
+    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, 16, min_weight=1e-4).train(trained)
+    density: Callable[[Tensor], Tensor] = lambda x: torch.full_like(x[..., 0], 1e-3)  # noqa: E731
+    samples = sampler(rays_towards_origin(64), FormulaField(density, lambda x, d, t: x))
+    assert samples.starts.shape == (0,)
+    assert bool((sampler.maxima == 1e-3).any()) == trained
