@@ -140,6 +140,34 @@ class Samples:
         directions = rows[..., 3:6]
         return torch.addcmul(rows[..., :3], self.distances[..., None], directions), directions, rows[..., 6]
 
+    def padded(self, multiple: int) -> "Samples":
+        """Packed samples with intervals of length zero after the last one, up to a multiple of so many.
+
+        They add nothing to a picture. Matrix libraries compile code for every new number of rows, so that few
+        different numbers are quicker. No samples stay none; proposals are kept.
+
+        Raises:
+            ValueError: for dense samples.
+        """
+        if self.ray_indices is None:
+            raise ValueError("samples must be packed to be padded, got dense samples")
+        count = len(self.starts)
+        padding = -count % multiple if count else 0
+        if not padding:
+            return self
+
+        def extended(values: Tensor) -> Tensor:
+            return torch.cat([values, values[-1:].expand(padding)])
+
+        return replace(
+            self,
+            starts=torch.cat([self.starts, self.ends[-1:].expand(padding)]),
+            ends=extended(self.ends),
+            ray_indices=extended(self.ray_indices),
+            points=None if self.points is None else extended(self.points),
+            ray_offsets=self.offsets + padding * (self.offsets == count),
+        )
+
     def packed(self, mask: Tensor | None = None) -> "Samples":
         """Return dense samples as packed ones, only those where `mask` (R, S) holds (all if None)."""
         if self.ray_indices is not None:

@@ -3,16 +3,18 @@
 from itertools import chain
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dnerf.backgrounds import Background, ConstantBackground
 from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
-from dnerf.compositing import Rendering, composite
+from dnerf.compositing import Rendering, composite, safe_divide
 from dnerf.fields.base import RadianceField
-from dnerf.rays import Rays
+from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
+from dnerf.samplers.visibility import walk_front_to_back
 
+PAD_TO = 2048  # samples; see `Samples.padded`
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
 
 
@@ -25,9 +27,11 @@ class Renderer(nn.Module):
         background: what lies behind; white if None.
         precision: "float32", or "bfloat16" to run networks under autocast; positions, encodings and compositing stay
             float32 either way.
+        stop_transmittance: whole images end a ray of packed samples once so little light is left, which changes
+            colours by at most as much; 0 to ask the field everywhere.
 
     Raises:
-        ValueError: for another precision.
+        ValueError: for another precision, or a transmittance outside [0, 1).
     """
 
     def __init__(
@@ -37,13 +41,17 @@ class Renderer(nn.Module):
         background: Background | None = None,
         *,
         precision: str = "float32",
+        stop_transmittance: float = 0.0,
     ) -> None:
         super().__init__()
+        if not 0 <= stop_transmittance < 1:
+            raise ValueError(f"stop_transmittance must be in [0, 1), got {stop_transmittance}")
         check_choice("precision", precision, tuple(PRECISIONS))
         self.field = field
         self.sampler = sampler
         self.background = ConstantBackground("white") if background is None else background
         self.precision = precision
+        self.stop_transmittance = stop_transmittance
 
     @property
     def device(self) -> torch.device:
@@ -59,6 +67,10 @@ class Renderer(nn.Module):
         """
         with self._autocast(rays.origins.device):
             samples = self.sampler(rays, self.field, generator=generator)
+        return self._render(rays, samples, generator)
+
+    def _render(self, rays: Rays, samples: Samples, generator: torch.Generator | None) -> Rendering:
+        with self._autocast(rays.origins.device):
             positions, directions, times = samples.locate(rays)
             output = self.field(positions, directions, times)
         if self.training:
@@ -69,6 +81,27 @@ class Renderer(nn.Module):
             return rendering
         proposals = tuple(composite(placed, said, background) for placed, said in samples.proposals)
         return Rendering(**{**vars(rendering), "proposals": proposals})
+
+    def _without_gradients(self, rays: Rays) -> Rendering:
+        """What `forward` shows, without per-sample data: rays end where they are opaque."""
+        with self._autocast(rays.origins.device):
+            samples = self.sampler(rays, self.field)
+        if not samples.is_packed or self.stop_transmittance == 0:
+            return self._render(rays, samples, None)
+        sums = rays.origins.new_zeros(len(rays), 5)
+
+        def visit(ray_numbers: Tensor, chosen: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
+            with self._autocast(rays.origins.device):
+                output = self.field(*part.locate(rays[ray_numbers]))
+            seen = composite(part, output)
+            columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
+            sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))
+            return 1 - seen.opacity
+
+        walk_front_to_back(samples, self.stop_transmittance, visit, pad_to=PAD_TO)
+        rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
+        rgb = rgb + (1 - opacity)[:, None] * self.background(rays.directions)
+        return Rendering(rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity))
 
     def update(self, step: int) -> None:
         """Let the sampler learn from the field, between training steps; `step` counts those done."""
@@ -108,7 +141,7 @@ class Renderer(nn.Module):
         modes = [(module, module.training) for module in self.modules()]
         self.eval()
         try:
-            parts = [self(rays[i : i + chunk]) for i in range(0, len(rays), chunk)]
+            parts = [self._without_gradients(rays[i : i + chunk]) for i in range(0, len(rays), chunk)]
         finally:
             for module, mode in modes:
                 module.training = mode

@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 from reference import composite_ray, fog, rays_towards_origin, soft_ball
-from torch import nn
+from torch import Tensor, nn
 
 from dnerf.backgrounds import ConstantBackground, RandomBackground
 from dnerf.cameras import Camera, Intrinsics, look_at
-from dnerf.compositing import Rendering
+from dnerf.compositing import FieldOutput, Rendering
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, NeRFField, RadianceField
 from dnerf.renderer import Renderer
-from dnerf.samplers import ImportanceSampler, StratifiedSampler
+from dnerf.samplers import ImportanceSampler, OccupancySampler, StratifiedSampler
 
 
 def seeded(seed: int) -> torch.Generator:
@@ -230,3 +230,58 @@ def test_all_empty_rays_show_the_background(sampler: str) -> None:
 def test_renderer_without_rays_gives_no_pixels() -> None:
     renderer: nn.Module = Renderer(trained_field(), ImportanceSampler(4, 4))
     assert renderer(rays_towards_origin(3)[:0]).rgb.shape == (0, 3)
+
+
+class CountingFog(RadianceField):
+    """A ball of fog that remembers at how many points it was asked."""
+
+    def __init__(self, density: float) -> None:
+        super().__init__()
+        self.strength = density
+        self.num_points = 0
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        return self.strength * (positions.norm(dim=-1) < 0.9).to(positions.dtype)
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        self.num_points += len(times)
+        return FieldOutput(self.density(positions, times), torch.sigmoid(4 * positions))
+
+
+BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize("density", [0.0, 0.5, 3.0, 100.0])
+@pytest.mark.parametrize("stop", [1e-4, 1e-2, 0.3])
+def test_rays_that_end_early_change_colours_by_no_more_than_the_light_left(density: float, stop: float) -> None:
+    field = CountingFog(density)
+    whole = Renderer(field, OccupancySampler(BOX, 0.02))
+    early = Renderer(field, OccupancySampler(BOX, 0.02), stop_transmittance=stop)
+    camera = some_camera(63, 51)
+    exact = whole.render_image(camera, 0.5)
+    asked, field.num_points = field.num_points, 0
+    image = early.render_image(camera, 0.5)
+    assert (image.rgb - exact.rgb).abs().max() <= stop + 1e-6
+    assert (image.opacity - exact.opacity).abs().max() <= stop + 1e-6
+    # Light left over is at most `stop`, and is absorbed within the box, 2 sqrt(3) across.
+    assert ((image.depth - exact.depth) * exact.opacity).abs().max() <= stop * 2 * math.sqrt(3) + 1e-5
+    if density == 100.0:
+        # Rays through the corners of the box meet no ball and never end.
+        assert field.num_points < 0.65 * asked
+
+
+def test_images_with_and_without_early_ends_agree_where_nothing_is_opaque() -> None:
+    """Rounds are put together without loss: only rounding differs."""
+    field = CountingFog(0.5)
+    whole = Renderer(field, OccupancySampler(BOX, 0.02)).render_image(some_camera(21, 17), 0.5)
+    rounds = Renderer(field, OccupancySampler(BOX, 0.02), stop_transmittance=1e-6).render_image(
+        some_camera(21, 17), 0.5
+    )
+    for name in ("rgb", "opacity", "depth"):
+        torch.testing.assert_close(getattr(rounds, name), getattr(whole, name), rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("stop", [-0.1, 1.0, math.nan])
+def test_a_stop_outside_its_range_is_refused(stop: float) -> None:
+    with pytest.raises(ValueError, match=r"stop_transmittance must be in \[0, 1\)"):
+        Renderer(fog(), StratifiedSampler(4), stop_transmittance=stop)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dnerf.checks import as_box, check_positive
 from dnerf.fields.base import RadianceField
-from dnerf.kernels import MarchedSamples, march, skip_distances
+from dnerf.kernels import march, skip_distances
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 from dnerf.samplers.visibility import visible_samples
@@ -37,8 +37,10 @@ class OccupancySampler(Sampler):
         update_every: training steps between updates.
         num_probes: random cells asked at each update.
         margin: cells by which occupied regions are widened in space (0 or 1); time is widened by one slab.
-        pad_to: the number of samples is rounded up to a multiple of this by intervals of length zero, since matrix
-            libraries compile code for every new number of rows (1 for no padding).
+        min_weight: in training, the field is first asked for densities without gradients, front to back, and only
+            samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. (Pictures without
+            gradients end rays early instead: `Renderer.stop_transmittance`.)
+        pad_to: the number of samples is rounded up to a multiple of this, see `Samples.padded` (1 for no padding).
 
     Raises:
         ValueError: for numbers out of range.
@@ -115,31 +117,25 @@ class OccupancySampler(Sampler):
             step=self.step_size,
             skips=self.skips,
         )
-        if self.min_weight > 0 and len(marched.starts):
-            marched = self._visible(marched, rays, field)
-        return self._padded(marched, len(rays))
+        samples = Samples(
+            marched.starts, marched.ends, len(rays), ray_indices=marched.ray_indices, ray_offsets=marched.offsets
+        )
+        if self.training and self.min_weight > 0:
+            samples = self._visible(samples, rays, field)
+        return samples.padded(self.pad_to)
 
-    def _visible(self, marched: MarchedSamples, rays: Rays, field: RadianceField) -> MarchedSamples:
-        """Only the samples that can be seen."""
-        starts, ends, ray_indices, offsets = marched
-        samples = Samples(starts, ends, len(rays), ray_indices=ray_indices, ray_offsets=offsets)
-        observe = self.observe if self.training else None
-        marked = visible_samples(samples, rays, field, self.min_weight, pad_to=self.pad_to, observe=observe)
+    def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
+        marked = visible_samples(samples, rays, field, self.min_weight, pad_to=self.pad_to, observe=self.observe)
         kept = marked.nonzero()[:, 0]
         kept_before = torch.nn.functional.pad(marked.cumsum(0), (1, 0))
-        return MarchedSamples(starts[kept], ends[kept], ray_indices[kept], kept_before[offsets])
-
-    def _padded(self, marched: MarchedSamples, num_rays: int) -> Samples:
-        """Add intervals of length zero after the last one, up to a multiple of `pad_to`."""
-        starts, ends, ray_indices, offsets = marched
-        count = len(starts)
-        padding = -count % self.pad_to if count else 0
-        if padding:
-            last = ends[-1:].expand(padding)
-            starts, ends = torch.cat([starts, last]), torch.cat([ends, last])
-            ray_indices = torch.cat([ray_indices, ray_indices[-1:].expand(padding)])
-            offsets = offsets + padding * (offsets == count)
-        return Samples(starts, ends, num_rays, ray_indices=ray_indices, ray_offsets=offsets)
+        assert samples.ray_indices is not None
+        return Samples(
+            samples.starts[kept],
+            samples.ends[kept],
+            samples.num_rays,
+            ray_indices=samples.ray_indices[kept],
+            ray_offsets=kept_before[samples.offsets],
+        )
 
     @torch.no_grad()
     def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:

@@ -1,15 +1,59 @@
-"""Which of a ray's samples can be seen: those that are neither empty nor hidden behind opaque matter."""
+"""Walking rays front to back in rounds, so that what lies behind opaque matter is never asked for."""
 
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from dnerf.compositing import render_weights, sum_along_rays
 from dnerf.fields.base import RadianceField
-from dnerf.kernels import packed_sum, packed_weights
 from dnerf.rays import Rays, Samples
 
+Visitor = Callable[[Tensor, Tensor, Samples, Tensor], Tensor]
 Observer = Callable[[Tensor, Tensor, Tensor], None]
+
+
+@torch.no_grad()
+def walk_front_to_back(
+    samples: Samples, stop_transmittance: float, visit: Visitor, *, first_round: int = 8, pad_to: int = 1
+) -> None:
+    """Visit packed samples in rounds: each ray's first few, twice as many, and so on, until it is opaque or at its end.
+
+    Source: early ray termination (Levoy 1990), here for whole batches of rays at a time.
+
+    Args:
+        samples: N packed samples of R rays.
+        stop_transmittance: a ray whose transmittance has fallen to this takes no further part.
+        visit: called with the numbers (K,) of the rays that take part, the numbers (n,) of their samples, those
+            samples as packed samples of K rays, and the rays' transmittance (K,) before them; returns the share (K,)
+            of light that passes them.
+        first_round: samples per ray in the first round.
+        pad_to: rounds are padded to a multiple of so many samples, see `Samples.padded`.
+    """
+    offsets, counts = samples.offsets, samples.offsets.diff()
+    transmittance = samples.starts.new_ones(samples.num_rays)
+    open_rays = (counts > 0).nonzero()[:, 0]
+    taken, size = 0, first_round
+    while len(open_rays):
+        used = (counts[open_rays] - taken).clamp(max=size)
+        part_offsets = torch.nn.functional.pad(used.cumsum(0), (1, 0))
+        total = int(part_offsets[-1])
+        local = torch.repeat_interleave(used, output_size=total)
+        shift = (offsets[open_rays] + taken - part_offsets[:-1]).index_select(0, local)
+        chosen = torch.arange(total, device=local.device) + shift
+        part = Samples(
+            samples.starts.index_select(0, chosen),
+            samples.ends.index_select(0, chosen),
+            len(open_rays),
+            ray_indices=local,
+            points=None if samples.points is None else samples.points.index_select(0, chosen),
+            ray_offsets=part_offsets,
+        )
+        before = transmittance[open_rays]
+        after = before * visit(open_rays, chosen, part.padded(pad_to), before)
+        transmittance[open_rays] = after
+        taken, size = taken + size, 2 * size
+        open_rays = open_rays[(after > stop_transmittance) & (counts[open_rays] > taken)]
 
 
 @torch.no_grad()
@@ -25,58 +69,32 @@ def visible_samples(
 ) -> Tensor:
     """Ask the field's density front to back and mark the samples whose weight exceeds `min_weight`.
 
-    Rays are walked in rounds of `first_round` samples, twice as many, and so on; a ray whose transmittance has
-    fallen to `min_weight` takes no further part, so what lies behind a surface costs nothing (early ray
-    termination: Levoy 1990; as a filter before the pass with gradients: nerfacc). A picture of the marked samples
-    alone differs from that of all by at most `min_weight` for each sample in front and `min_weight` for all behind.
+    A picture of the marked samples alone differs from that of all by at most `min_weight` for each sample in front
+    and `min_weight` for all behind. As a filter before the pass with gradients it is nerfacc's (arXiv 2305.04966).
 
     Args:
         samples: N packed samples of the rays.
         rays: R rays.
         field: whose density decides.
         min_weight: least weight that counts, in (0, 1).
-        first_round: samples per ray in the first round.
+        first_round: samples per ray in the first round, see `walk_front_to_back`.
         pad_to: the field is asked a multiple of so many points.
         observe: told positions (n, 3), times (n,) and density (n,) of every round.
 
     Returns:
         (N,) bool.
     """
-    assert samples.ray_indices is not None
-    origins, directions, times = rays.origins, rays.directions, rays.times
-    per_ray = torch.cat([origins, directions, times[:, None]], dim=-1)
     marked = torch.zeros_like(samples.starts, dtype=torch.bool)
-    depth = torch.zeros_like(rays.near)
-    counts = samples.offsets.diff()
-    taken, size = 0, first_round
-    open_rays = (counts > 0).nonzero()[:, 0]
-    while len(open_rays):
-        used = (counts[open_rays] - taken).clamp(max=size)
-        offsets = torch.nn.functional.pad(used.cumsum(0), (1, 0))
-        total = int(offsets[-1])
-        local = torch.repeat_interleave(used, output_size=total)
-        chosen = torch.arange(total, device=local.device) + (samples.offsets[open_rays] + taken - offsets[:-1])[local]
-        rows = per_ray.index_select(0, open_rays.index_select(0, local))
-        positions = torch.addcmul(rows[:, :3], samples.distances[chosen, None], rows[:, 3:6])
-        density = _padded_density(field, positions, rows[:, 6], pad_to)
+
+    def visit(ray_numbers: Tensor, chosen: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
+        positions, _, times = part.locate(rays[ray_numbers])
+        density = field.density(positions, times)
         if observe is not None:
-            observe(positions, rows[:, 6], density)
-        optical_depth = density * samples.lengths[chosen]
-        before = depth[open_rays]
-        weights = packed_weights(optical_depth, offsets) * torch.exp(-before)[local]
-        marked[chosen] = weights > min_weight
-        before = before + packed_sum(optical_depth, None, offsets)
-        depth[open_rays] = before
-        taken += size
-        size *= 2
-        open_rays = open_rays[(torch.exp(-before) > min_weight) & (counts[open_rays] > taken)]
+            observe(positions, times, density)
+        optical_depth = density * part.lengths
+        weights = render_weights(optical_depth, part) * part.per_sample(transmittance)
+        marked[chosen] = weights[: len(chosen)] > min_weight
+        return torch.exp(-sum_along_rays(optical_depth, part))
+
+    walk_front_to_back(samples, min_weight, visit, first_round=first_round, pad_to=pad_to)
     return marked
-
-
-def _padded_density(field: RadianceField, positions: Tensor, times: Tensor, pad_to: int) -> Tensor:
-    count = len(times)
-    padding = -count % pad_to
-    if padding:
-        positions = torch.cat([positions, positions[-1:].expand(padding, 3)])
-        times = torch.cat([times, times[-1:].expand(padding)])
-    return field.density(positions, times)[:count]
