@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dnerf.checks import as_box, check_positive
 from dnerf.fields.base import RadianceField
@@ -92,7 +92,8 @@ class OccupancySampler(Sampler):
         self.register_buffer("strides", torch.tensor(torch.empty(num_slabs, *cells).stride()), persistent=False)
         self.register_buffer("maxima", torch.full((num_slabs, *cells), NEGLIGIBLE * 1e-3))
         self.register_buffer("occupied", torch.ones((num_slabs, *cells), dtype=torch.bool))
-        self.register_buffer("skips", skip_distances(self.occupied))
+        self.register_buffer("skips", skip_distances(self.occupied), persistent=False)
+        self.register_load_state_dict_post_hook(_find_skips)
         self.box: Tensor
         self.shape: Tensor
         self.strides: Tensor
@@ -191,6 +192,12 @@ class OccupancySampler(Sampler):
         for axis in range(4 if self.margin else 1):
             self.occupied.copy_(_widened(self.occupied, axis))
         self.skips.copy_(skip_distances(self.occupied))
+
+
+def _find_skips(sampler: nn.Module, incompatible_keys: object) -> None:
+    """Derive a loaded sampler's skips, which are not saved."""
+    assert isinstance(sampler, OccupancySampler)
+    sampler.skips.copy_(skip_distances(sampler.occupied))
 
 
 def _widened(mask: Tensor, axis: int) -> Tensor:
