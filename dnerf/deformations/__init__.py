@@ -2,7 +2,6 @@
 
 from dnerf.deformations.base import Deformation, InvertibleDeformation
 from dnerf.deformations.displacement import DisplacementDeformation
-from dnerf.deformations.grid import GridDeformation
 from dnerf.deformations.identity import IdentityDeformation
 
-__all__ = ["Deformation", "DisplacementDeformation", "GridDeformation", "IdentityDeformation", "InvertibleDeformation"]
+__all__ = ["Deformation", "DisplacementDeformation", "IdentityDeformation", "InvertibleDeformation"]

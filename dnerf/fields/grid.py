@@ -1,6 +1,5 @@
 """A multi-resolution feature grid with a tiny head as a canonical field."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -53,7 +52,6 @@ class GridField(RadianceField):
         view_degree: int | None = None,
         density_activation: str = "exp",
         density_shift: float = -1.0,
-        window_end: float | None = None,
     ) -> None:
         super().__init__()
         check_positive("num_features", num_features)
@@ -63,11 +61,6 @@ class GridField(RadianceField):
         self.levels = GridLevels(cells, max_rows)
         self.density_activation = density_activation
         self.density_shift = density_shift
-        self.window_end = window_end
-        self.num_features = num_features
-        opening = torch.ones(self.levels.num_levels) if window_end is None else torch.zeros(self.levels.num_levels)
-        self.register_buffer("window", opening, persistent=window_end is not None)
-        self.window: Tensor
         self.register_buffer("low", corners[0], persistent=False)
         self.register_buffer("scale", 1 / sides, persistent=False)
         self.low: Tensor
@@ -84,22 +77,11 @@ class GridField(RadianceField):
             self.head = MLP(in_features, hidden_features, num_layers, out_features=1 + hidden_features)
             self.to_rgb = MLP(hidden_features + self.encode_directions.out_features, hidden_features, 1, out_features=3)
 
-    def set_progress(self, progress: float) -> None:
-        """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
-        if self.window_end is None:
-            return
-        number = self.levels.num_levels
-        alpha = 1 + (number - 1) * min(progress / self.window_end, 1.0)
-        levels = torch.arange(number, device=self.window.device)
-        self.window.copy_(0.5 * (1 - torch.cos(math.pi * (alpha - levels).clamp(0, 1))))
-
     def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
         check_positions_times(positions, times)
         unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
         features = grid_encode(unit.reshape(-1, 3), self.table, self.levels)
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
-        if self.window_end is not None:
-            features = features * self.window.repeat_interleave(self.num_features)
         if self.encode_times is not None:
             features = torch.cat([features, self.encode_times(times[..., None])], dim=-1)
         return self.head(features)
