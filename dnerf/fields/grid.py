@@ -1,5 +1,6 @@
 """A multi-resolution feature grid with a tiny head as a canonical field."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -34,6 +35,9 @@ class GridField(RadianceField):
         view_degree: spherical-harmonics degree of the direction that a second, colour-only head sees; None for matte.
         density_activation: "softplus" or "exp".
         density_shift: added before the activation; negative for a thin start.
+        window_end: fraction of training, in (0, 1], at which every level is in; finer levels fade in one after the
+            other, so that a deformation is first found by coarse shapes, whose gradients reach far (Nerfies, arXiv
+            2011.12948, eq. 8, for grids). None for all levels from the start.
 
     Raises:
         ValueError: for a box, resolutions or sizes out of range.
@@ -52,15 +56,22 @@ class GridField(RadianceField):
         view_degree: int | None = None,
         density_activation: str = "exp",
         density_shift: float = -1.0,
+        window_end: float | None = None,
     ) -> None:
         super().__init__()
         check_positive("num_features", num_features)
+        if window_end is not None and not 0 < window_end <= 1:
+            raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
         corners = as_box(box)
         sides = corners[1] - corners[0]
         cells = [[max(1, round(r * float(s / sides.max()))) for s in sides] for r in resolutions]
         self.levels = GridLevels(cells, max_rows)
         self.density_activation = density_activation
         self.density_shift = density_shift
+        self.window_end = window_end
+        levels = torch.arange(self.levels.num_levels)
+        self.register_buffer("window", (levels == 0).float(), persistent=window_end is not None)
+        self.window: Tensor
         self.register_buffer("low", corners[0], persistent=False)
         self.register_buffer("scale", 1 / sides, persistent=False)
         self.low: Tensor
@@ -77,11 +88,21 @@ class GridField(RadianceField):
             self.head = MLP(in_features, hidden_features, num_layers, out_features=1 + hidden_features)
             self.to_rgb = MLP(hidden_features + self.encode_directions.out_features, hidden_features, 1, out_features=3)
 
+    def set_progress(self, progress: float) -> None:
+        """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
+        if self.window_end is None:
+            return
+        levels = torch.arange(len(self.window), device=self.window.device)
+        opened = (len(levels) - 1) * min(progress / self.window_end, 1.0) - levels + 1
+        self.window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))
+
     def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
         check_positions_times(positions, times)
         unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
         features = grid_encode(unit.reshape(-1, 3), self.table, self.levels)
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
+        if self.window_end is not None:
+            features = features * self.window.repeat_interleave(self.table.shape[1]).to(features.dtype)
         if self.encode_times is not None:
             features = torch.cat([features, self.encode_times(times[..., None])], dim=-1)
         return self.head(features)

@@ -1,5 +1,7 @@
 """The grid field: its box, and parts that do not exist unless asked for."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -66,3 +68,48 @@ def test_time_features_let_a_place_change_with_time() -> None:
 def test_bad_grids_are_refused(box: list, options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         GridField(box, **options)
+
+
+def influence(field: GridField) -> list[float]:
+    """How much each level's rows move the density."""
+    times = torch.zeros(500)
+    positions = torch.tensor(BOX)[0] + torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2
+    (gradient,) = torch.autograd.grad(field.density(positions, times).sum(), field.table)
+    rows = [level[3] for level in field.levels.describe()] + [len(gradient)]
+    return [float(gradient[a:b].abs().sum()) for a, b in pairwise(rows)]
+
+
+def test_finer_levels_fade_in_one_after_the_other() -> None:
+    field = small(window_end=0.5)
+    seen = []
+    for progress in (0.0, 0.125, 0.25, 0.5, 1.0):
+        field.set_progress(progress)
+        seen.append(field.window.tolist())
+        assert [i > 0 for i in influence(field)] == [w > 0 for w in field.window.tolist()]
+    # (1 - cos(pi / 4)) / 2 a quarter of the way, 1 / 2 half way.
+    expected = torch.tensor([[1, 0], [1, 0.14644661], [1, 0.5], [1, 1], [1, 1]])
+    torch.testing.assert_close(torch.tensor(seen), expected, rtol=0, atol=1e-6)
+
+
+def test_an_open_window_changes_nothing() -> None:
+    windowed, plain = small(window_end=0.3), small()
+    windowed.set_progress(1.0)
+    plain.load_state_dict({name: value for name, value in windowed.state_dict().items() if name != "window"})
+    positions, times = torch.rand(50, 3), torch.rand(50)
+    assert torch.equal(windowed.density(positions, times), plain.density(positions, times))
+    plain.set_progress(0.0)
+    assert torch.equal(windowed.density(positions, times), plain.density(positions, times))
+
+
+def test_the_window_is_saved_with_the_field() -> None:
+    field, loaded = small(window_end=0.5), small(window_end=0.5)
+    field.set_progress(0.2)
+    loaded.load_state_dict(field.state_dict())
+    assert torch.equal(loaded.window, field.window)
+    assert "window" not in small().state_dict()
+
+
+@pytest.mark.parametrize("end", [0.0, -1.0, 1.5])
+def test_a_window_outside_the_training_is_refused(end: float) -> None:
+    with pytest.raises(ValueError, match=r"window_end must be in \(0, 1\]"):
+        small(window_end=end)
