@@ -28,7 +28,7 @@ class MLP(nn.Module):
         activation: "relu", or "silu" or "softplus" for a smooth network.
 
     Raises:
-        ValueError: for an unknown activation, or if sizes are not positive or a skip names no hidden layer but the first.
+        ValueError: if sizes are not positive, a skip names no hidden layer but the first, or the activation is unknown.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Motion that a model has recovered: material points carried between times, tracks, motion vectors of pictures.
 
-Everything here works for an invertible deformation, for any other one through `dnerf.deformations.invert` (a fixed-point
-inverse; look at the residuals), and for analytic scenes, whose motion is exact.
+Everything here works for an invertible deformation, for any other one through `dnerf.deformations.invert` (a
+fixed-point inverse; look at the residuals), and for analytic scenes, whose motion is exact.
 """
 
 from dataclasses import dataclass

@@ -31,7 +31,9 @@ FLOORS = {
     "losses": 6,
     "metrics": 6,
     "motion": 6,
+    "motion_losses": 6,
     # 7: whole runs.
+    "benchmarks": 7,
     "checkpoints": 7,
     "distributed": 7,
     "evaluation": 7,
@@ -43,7 +45,7 @@ FLOORS = {
 }
 
 # Imports within a floor, each deliberate: `checks` is the ground of floor 0, compositing is built on its kernels,
-# logs record what training, evaluation and video make.
+# losses about motion are losses, logs record what training, evaluation and video make.
 WITHIN_A_FLOOR = {
     ("compositing", "kernels"),
     ("encodings", "checks"),
@@ -53,6 +55,7 @@ WITHIN_A_FLOOR = {
     ("logs", "training"),
     ("logs", "video"),
     ("mlp", "checks"),
+    ("motion_losses", "losses"),
     ("rays", "checks"),
 }
 

@@ -5,6 +5,7 @@ from dnerf.deformations.displacement import DisplacementDeformation
 from dnerf.deformations.fixed_point import invert
 from dnerf.deformations.flow import FlowDeformation
 from dnerf.deformations.identity import IdentityDeformation
+from dnerf.deformations.lattice_flow import LatticeFlow
 from dnerf.deformations.solvers import IntegrationError
 
 __all__ = [
@@ -14,5 +15,6 @@ __all__ = [
     "IdentityDeformation",
     "IntegrationError",
     "InvertibleDeformation",
+    "LatticeFlow",
     "invert",
 ]

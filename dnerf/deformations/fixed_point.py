@@ -1,15 +1,20 @@
 """The inverse of a deformation that has none of its own, point by point."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from dnerf.checks import check_positive, check_shape
-from dnerf.deformations.base import Deformation, check_positions_times
+from dnerf.deformations.base import check_positions_times
+
+Map = Callable[[Tensor, Tensor], Tensor]
+"""Positions (..., 3) and times (...,) to positions (..., 3): a deformation, or several in a row."""
 
 
 @torch.no_grad()
 def invert(
-    deformation: Deformation,
+    deformation: Map,
     canonical: Tensor,
     times: Tensor,
     *,
@@ -69,6 +74,33 @@ def invert(
         best = torch.where(better[..., None], x, best)
         residual = torch.where(better, distance, residual)
     return best, residual
+
+
+def attach_gradient(deformation: Map, world: Tensor, canonical: Tensor, times: Tensor) -> Tensor:
+    """Give solved world positions the gradient of the exact inverse, by one Newton step from them.
+
+    By the implicit function theorem `x - J^-1 (deformation(x, t) - canonical)`, with x and J = d deformation / dx at
+    the solution held fixed, has the inverse's value up to rounding and its first derivatives to canonical positions,
+    times and parameters.
+
+    Args:
+        deformation: world -> canonical.
+        world: (..., 3) where deformation(world, times) is canonical.
+        canonical: (..., 3).
+        times: (...,).
+
+    Returns:
+        (..., 3) world positions.
+
+    Differentiable once. J must not be singular.
+    """
+    world = world.detach()
+    with torch.enable_grad():
+        x = world.clone().requires_grad_()
+        moved = deformation(x, times.detach())
+        rows = [torch.autograd.grad(moved[..., i].sum(), x, retain_graph=i < 2)[0] for i in range(3)]
+    inverse_jacobian = torch.linalg.inv(torch.stack(rows, dim=-2))
+    return world - _apply(inverse_jacobian, deformation(world, times) - canonical)
 
 
 def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from dnerf.checks import check_choice, check_positive
 from dnerf.deformations.base import InvertibleDeformation, check_positions_times
+from dnerf.deformations.fixed_point import attach_gradient, invert
 from dnerf.deformations.solvers import RightHandSide, Solver, failure
 from dnerf.deformations.velocities.base import Velocity
 
@@ -53,8 +54,8 @@ class FlowDeformation(InvertibleDeformation):
         atol: of an adaptive solver, in world units.
         gradient: "direct" or "adjoint", see `Solver`.
         max_steps: of an adaptive solver.
-        corrections: rounds that make `inverse` the inverse of the *discretised* `forward`: the equation solved
-            backwards misses it by both solves' errors; each round shrinks what is left by about that error.
+        corrections: round trips by which `inverse` is made the inverse of the *discretised* `forward` (see `invert`):
+            the equation solved backwards, which 0 leaves as it is, misses it by both solves' errors.
 
     Raises:
         ValueError: for settings out of range, or a running clock without a canonical time.
@@ -72,7 +73,7 @@ class FlowDeformation(InvertibleDeformation):
         atol: float = 1e-6,
         gradient: str = "direct",
         max_steps: int = 1000,
-        corrections: int = 2,
+        corrections: int = 6,
     ) -> None:
         super().__init__()
         check_choice("clock", clock, CLOCKS)
@@ -101,10 +102,19 @@ class FlowDeformation(InvertibleDeformation):
     def inverse(self, canonical: Tensor, times: Tensor) -> Tensor:
         """World positions (..., 3) at times (...,) of canonical positions (..., 3); raises as `forward`."""
         check_positions_times(canonical, times)
-        world, target = self.reverse(canonical, times), canonical
-        for _ in range(self.corrections):
-            target = target - (self.forward(world, times) - canonical)
+        if not self.corrections or not canonical.numel():
+            return self.reverse(canonical, times)
+
+        # There and back is nearly the identity, so the fixed-point iteration begins close to its end.
+        def round_trip(target: Tensor, times: Tensor) -> Tensor:
+            return self(self.reverse(target, times), times)
+
+        with torch.no_grad():
+            target, _ = invert(round_trip, canonical, times, num_iterations=self.corrections)
             world = self.reverse(target, times)
+        trained = any(parameter.requires_grad for parameter in self.parameters())
+        if torch.is_grad_enabled() and (trained or canonical.requires_grad or times.requires_grad):
+            return attach_gradient(self, world, canonical, times)
         return world
 
     def reverse(self, canonical: Tensor, times: Tensor) -> Tensor:
@@ -119,21 +129,30 @@ class FlowDeformation(InvertibleDeformation):
         self.evaluations.last = 0
         self.evaluations.solves += 1
         right_hand_side = self._right_hand_side(start, spans)
-        problem = None
+        reached: tuple[float, Tensor] = (0.0, positions)
+
+        def watch(s: float | Tensor, x: Tensor) -> None:
+            nonlocal reached
+            self.evaluations.last += 1
+            self.evaluations.total += 1
+            if self.solver.is_adaptive:
+                reached = (float(torch.as_tensor(s).detach()), x.detach())
+
+        def watched(s: float | Tensor, x: Tensor) -> Tensor:
+            watch(s, x)
+            return right_hand_side(s, x)
+
+        problem = "positions are not finite"
         try:
             if self.solver.gradient == "adjoint":
-                equation = _AdjointEquation(self)
-                result = self.solver.solve_adjoint(equation, (positions, start, spans))[0]
+                result = self.solver.solve_adjoint(_AdjointEquation(self, watch), (positions, start, spans))[0]
             else:
-                result = self.solver.solve(right_hand_side, positions)
+                result = self.solver.solve(watched, positions)
+            if bool(torch.isfinite(result).all()):
+                return result
         except AssertionError as error:
-            problem = str(error)
-        else:
-            if not bool(torch.isfinite(result).all()):
-                problem = "positions are not finite"
-        if problem is not None:
-            raise failure(self.solver, problem, right_hand_side, positions, start, end) from None
-        return result
+            problem = f"the solver stopped ({error})"
+        raise failure(self.solver, problem, right_hand_side, reached, start, end) from None
 
     def _spans(self, times: Tensor, backwards: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Time at s = 0 and at s = 1, and the signed length of the way, (...,) each."""
@@ -148,33 +167,20 @@ class FlowDeformation(InvertibleDeformation):
         column = spans[..., None]
         if self.clock == "frozen":
             field = self.velocity.at(start)
-
-            def frozen(s: float | Tensor, positions: Tensor) -> Tensor:
-                self._count()
-                return column * field(positions)
-
-            return frozen
-
-        def running(s: float | Tensor, positions: Tensor) -> Tensor:
-            self._count()
-            return column * self.velocity(positions, start + s * spans)
-
-        return running
-
-    def _count(self) -> None:
-        self.evaluations.last += 1
-        self.evaluations.total += 1
+            return lambda s, positions: column * field(positions)
+        return lambda s, positions: column * self.velocity(positions, start + s * spans)
 
 
 class _AdjointEquation(nn.Module):
     """The flow's equation for (positions, start, spans), so that the adjoint reaches times as well."""
 
-    def __init__(self, flow: FlowDeformation) -> None:
+    def __init__(self, flow: FlowDeformation, watch: Callable[[Tensor, Tensor], None]) -> None:
         super().__init__()
         self.velocity = flow.velocity
-        self._make: Callable[[Tensor, Tensor], RightHandSide] = flow._right_hand_side
+        self._make = flow._right_hand_side
+        self._watch = watch
 
     def forward(self, s: Tensor, state: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         positions, start, spans = state
-        derivative = self._make(start, spans)(s, positions)
-        return derivative, torch.zeros_like(start), torch.zeros_like(spans)
+        self._watch(s, positions)
+        return self._make(start, spans)(s, positions), torch.zeros_like(start), torch.zeros_like(spans)

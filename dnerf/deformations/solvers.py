@@ -3,7 +3,6 @@
 With `start` and `end` per point, `dx/ds = (end - start) v(x, start + s (end - start))` runs over s in [0, 1] for all.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -16,7 +15,7 @@ from dnerf.checks import check_choice, check_positive
 FIXED_SOLVERS = {"euler": 1, "midpoint": 2, "rk4": 4}
 """Evaluations per step, which is also the order of each."""
 
-ADAPTIVE_SOLVERS = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
+ADAPTIVE_SOLVERS = ("dopri5", "dopri8", "bosh3", "adaptive_heun")
 SOLVERS = (*FIXED_SOLVERS, *ADAPTIVE_SOLVERS)
 GRADIENTS = ("direct", "adjoint")
 
@@ -33,7 +32,8 @@ class Solver:
 
     Args:
         name: "euler", "midpoint" or "rk4" (3/8 rule) with `num_steps` equal steps of s, written out here and equal to
-            torchdiffeq's to rounding; "dopri5", "dopri8", "bosh3", "fehlberg2" or "adaptive_heun" through torchdiffeq.
+            torchdiffeq's to rounding; "dopri5", "dopri8", "bosh3" or "adaptive_heun" through torchdiffeq (whose
+            fehlberg2 misses its tolerance by a factor of hundreds, and is left out).
         num_steps: of a fixed-step solver.
         rtol: relative tolerance of an adaptive one.
         atol: absolute tolerance of an adaptive one, in world units. In float32, tolerances below 1e-6 only cost.
@@ -99,7 +99,9 @@ class Solver:
         if not self.is_adaptive:
             # A step size would leave a tiny last step where 1 / num_steps rounds down.
             return {"method": self.name, "options": {"grid_constructor": self._equal_steps}}
-        options = {"norm": norm, "max_num_steps": self.max_steps}
+        # Steps end where the way ends (0 is the adjoint's end): torchdiffeq would step past it and interpolate, to
+        # fourth order only, which is all that a loose dopri8 would then be.
+        options = {"norm": norm, "max_num_steps": self.max_steps, "step_t": torch.tensor([0.0, 1.0])}
         return {"method": self.name, "rtol": self.rtol, "atol": self.atol, "options": options}
 
     def _equal_steps(self, _: Any, positions: Any, interval: Tensor) -> Tensor:
@@ -144,39 +146,38 @@ def _worst_point(values: Tensor) -> Tensor:
 
 
 def failure(
-    solver: Solver, reason: str, right_hand_side: RightHandSide, positions: Tensor, start: Tensor, end: Tensor
+    solver: Solver,
+    reason: str,
+    right_hand_side: RightHandSide,
+    reached: tuple[float, Tensor],
+    start: Tensor,
+    end: Tensor,
 ) -> IntegrationError:
-    """The error to raise for a failed integration: found by small steps that stop where positions break or move most.
+    """The error to raise for a failed integration, which names the worst point there and its time.
 
     Args:
         solver: that failed.
         reason: what happened, in words.
         right_hand_side: of the equation.
-        positions: (..., 3) at s = 0.
+        reached: s and positions (..., 3): of a fixed-step solver where it began, of an adaptive one where it stopped.
         start: (...,) time at s = 0.
         end: (...,) time at s = 1.
     """
-    num_steps = 64 if solver.is_adaptive else solver.num_steps
-    flat_start, flat_end = start.reshape(-1), end.reshape(-1)
-    fastest, where, index = -1.0, 0.0, 0
+    s, x = reached
     with torch.no_grad():
-        x = positions.detach()
-        for i in range(num_steps):
-            s = i / num_steps
-            speed = right_hand_side(s, x).reshape(-1, 3).norm(dim=-1)
-            broken = ~torch.isfinite(speed)
-            worst = int(broken.to(torch.int8).argmax() if bool(broken.any()) else speed.argmax())
-            if bool(broken.any()) or float(speed[worst]) > fastest:
-                fastest, where, index = float(speed[worst]), s, worst
-            if bool(broken.any()):
+        slope = right_hand_side(s, x)
+        for i in range(0 if solver.is_adaptive else solver.num_steps):
+            if not bool((torch.isfinite(slope) & torch.isfinite(x)).all()):
                 break
-            x = x + _increment("euler" if solver.is_adaptive else solver.name, right_hand_side, x, s, 1 / num_steps) / (
-                num_steps
-            )
-    begin, finish = float(flat_start[index]), float(flat_end[index])
-    length = abs(finish - begin)
-    speed_text = "not finite" if not math.isfinite(fastest) else f"{fastest / length if length else 0:.3g} per unit time"
+            s = i / solver.num_steps
+            x = x + _increment(solver.name, right_hand_side, x, s, 1 / solver.num_steps) / solver.num_steps
+            slope = right_hand_side(s, x)
+    speeds = (slope + 0 * x).reshape(-1, 3).norm(dim=-1)
+    # The first point that is not finite, or the fastest.
+    index = int(torch.where(torch.isfinite(speeds), speeds, torch.inf).argmax())
+    begin, finish = float(start.reshape(-1)[index]), float(end.reshape(-1)[index])
     return IntegrationError(
-        f"flow: {reason} at time {begin + where * (finish - begin):.4g} (point {index} of {len(flat_start)}, from time "
-        f"{begin:.4g} to {finish:.4g}, speed {speed_text}) with {solver.name}; {solver.advice()}"
+        f"flow: {reason} at time {begin + float(s) * (finish - begin):.4g} (point {index} of {len(speeds)}, on its way "
+        f"from time {begin:.4g} to {finish:.4g} at {float(speeds[index]):.3g} world units per way) with {solver.name}; "
+        f"{solver.advice()}"
     )

@@ -1,8 +1,8 @@
 """Velocity as a small network of position and time."""
 
+import math
 from collections.abc import Callable, Sequence
 
-import torch
 from torch import Tensor, nn
 
 from dnerf.checks import check_positive
@@ -52,8 +52,10 @@ class NetworkVelocity(Velocity):
         self.encode_times = SinusoidalEncoding(1, time_frequencies)
         self.from_positions = nn.Linear(self.encode_positions.out_features, hidden_features, bias=False)
         self.from_times = nn.Linear(self.encode_times.out_features, hidden_features)
-        nn.init.kaiming_uniform_(self.from_positions.weight, nonlinearity="relu")
-        nn.init.kaiming_uniform_(self.from_times.weight, nonlinearity="relu")
+        # As one layer of both inputs would start.
+        bound = math.sqrt(6 / (self.encode_positions.out_features + self.encode_times.out_features))
+        for layer in (self.from_positions, self.from_times):
+            nn.init.uniform_(layer.weight, -bound, bound)
         nn.init.zeros_(self.from_times.bias)
         self.mlp = MLP(
             hidden_features,
