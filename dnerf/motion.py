@@ -20,6 +20,12 @@ from dnerf.scenes import AnalyticScene
 
 MotionModel = Deformation | AnalyticScene
 
+SOLVED = 1e-4
+"""Residual, in world units, below which a fixed-point inverse counts as found."""
+
+NUM_STATIONS = 8
+"""Times through which a point is led whose inverse was not found at once."""
+
 
 def motion_model(field: RadianceField | Renderer) -> MotionModel:
     """What moves matter in a field or renderer: its deformation, or the analytic scene itself; identity if none."""
@@ -65,9 +71,25 @@ def carry(
             return model.advect(positions, before, after), torch.zeros_like(before)
         canonical = model(positions, before)
         if not isinstance(model, InvertibleDeformation):
-            return invert(model, canonical, after, guess=positions if guess is None else guess)
+            guess = positions if guess is None else guess
+            return _carry_by_fixed_point(model, canonical, before, after, positions, guess)
         moved = model.inverse(canonical, after)
         return moved, (model(moved, after) - canonical).norm(dim=-1)
+
+
+def _carry_by_fixed_point(
+    model: Deformation, canonical: Tensor, start: Tensor, end: Tensor, positions: Tensor, guess: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Invert from the guess; points that do not arrive are led from where they were, through times in between."""
+    world, residual = invert(model, canonical, end, guess=guess)
+    left = ~(residual < SOLVED)
+    target, before, after, x = canonical[left], start[left], end[left], positions[left]
+    miss = residual[left]
+    for k in range(1, NUM_STATIONS + 1):
+        x, miss = invert(model, target, torch.lerp(before, after, k / NUM_STATIONS), guess=x, use_jacobian=True)
+    better = miss < residual[left]
+    world = world.masked_scatter(left[..., None], torch.where(better[:, None], x, world[left]))
+    return world, residual.masked_scatter(left, torch.where(better, miss, residual[left]))
 
 
 def _per_point(time: float | Tensor, positions: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ def invert(
     guess: Tensor | None = None,
     num_iterations: int = 30,
     max_step: float = 0.5,
+    use_jacobian: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """World positions that a deformation carries to given canonical ones, and how well they do.
 
@@ -37,6 +38,8 @@ def invert(
         guess: (..., 3) where to begin; the canonical positions if None. A track's last position is a good one.
         num_iterations: evaluations of the deformation.
         max_step: longest step of one iteration, in world units.
+        use_jacobian: begin with the Jacobian at the guess (three backward passes) rather than with the identity:
+            converges near an answer however far the map is from the identity.
 
     Returns:
         world: (..., 3).
@@ -53,6 +56,11 @@ def invert(
     x = canonical if guess is None else guess
     check_shape("guess", x, canonical.shape)
     inverse_jacobian = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
+    if use_jacobian:
+        jacobian = _jacobians(deformation, x, times)
+        # Damped, for there to be a step where the map is flat.
+        damped = jacobian.mT @ jacobian + 1e-6 * inverse_jacobian
+        inverse_jacobian = torch.linalg.solve(damped, jacobian.mT)
     error = deformation(x, times) - canonical
     best, residual = x, error.norm(dim=-1)
     for _ in range(num_iterations - 1):
@@ -95,12 +103,17 @@ def attach_gradient(deformation: Map, world: Tensor, canonical: Tensor, times: T
     Differentiable once. J must not be singular.
     """
     world = world.detach()
+    inverse_jacobian = torch.linalg.inv(_jacobians(deformation, world, times))
+    return world - _apply(inverse_jacobian, deformation(world, times) - canonical)
+
+
+def _jacobians(deformation: Map, positions: Tensor, times: Tensor) -> Tensor:
+    """Derivatives (..., 3, 3) of canonical positions (rows) to world positions (columns), without gradient."""
     with torch.enable_grad():
-        x = world.clone().requires_grad_()
+        x = positions.detach().clone().requires_grad_()
         moved = deformation(x, times.detach())
         rows = [torch.autograd.grad(moved[..., i].sum(), x, retain_graph=i < 2)[0] for i in range(3)]
-    inverse_jacobian = torch.linalg.inv(torch.stack(rows, dim=-2))
-    return world - _apply(inverse_jacobian, deformation(world, times) - canonical)
+    return torch.stack(rows, dim=-2)
 
 
 def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
