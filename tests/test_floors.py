@@ -39,6 +39,7 @@ FLOORS = {
     "evaluation": 7,
     "logs": 7,
     "report": 7,
+    "tracks": 7,
     "training": 7,
     "video": 7,
     "viewer": 7,
@@ -56,6 +57,7 @@ WITHIN_A_FLOOR = {
     ("logs", "video"),
     ("mlp", "checks"),
     ("motion_losses", "losses"),
+    ("tracks", "video"),
     ("rays", "checks"),
 }
 

@@ -1,5 +1,7 @@
 """A flow map on a coarse lattice of space and time: integrate the vertices, interpolate the samples."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -34,7 +36,7 @@ class LatticeFlow(InvertibleDeformation):
     def __init__(
         self,
         flow: FlowDeformation,
-        box: list[list[float]],
+        box: Sequence[Sequence[float]],
         resolution: int = 24,
         num_knots: int = 33,
         *,
