@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dnerf.checks import check_positive
 from dnerf.compositing import Rendering
-from dnerf.deformations import FlowDeformation, LatticeFlow
+from dnerf.deformations import FlowDeformation, LatticeFlow, SkippingFlow
 from dnerf.fields import DeformedField
 from dnerf.losses import Loss
 from dnerf.renderer import Renderer
@@ -63,7 +63,7 @@ class MotionLoss(Loss):
 
     def _flow(self, renderer: Renderer) -> FlowDeformation:
         deformation = renderer.field.deformation if isinstance(renderer.field, DeformedField) else None
-        if isinstance(deformation, LatticeFlow):
+        if isinstance(deformation, LatticeFlow | SkippingFlow):
             deformation = deformation.flow
         if not isinstance(deformation, FlowDeformation):
             raise ValueError(

@@ -11,7 +11,14 @@ from torch import Tensor
 
 from dnerf.benchmarks.closed_flows import CLOSED_FLOWS, ClosedFlow
 from dnerf.checks import check_positive
-from dnerf.deformations import Deformation, DisplacementDeformation, FlowDeformation, IntegrationError, LatticeFlow
+from dnerf.deformations import (
+    Deformation,
+    DisplacementDeformation,
+    FlowDeformation,
+    IntegrationError,
+    LatticeFlow,
+    SkippingFlow,
+)
 from dnerf.deformations.solvers import ADAPTIVE_SOLVERS, FIXED_SOLVERS
 from dnerf.deformations.velocities import CurlVelocity, GridVelocity, NetworkVelocity, RigidVelocity, Velocity
 from dnerf.motion import MotionModel, carry
@@ -145,6 +152,8 @@ def variants() -> dict[str, Deformation]:
     frozen: dict[str, Any] = {"canonical_time": None, "clock": "frozen", "solver": "midpoint", "num_steps": 1}
     running: dict[str, Any] = {"canonical_time": 0.5, "solver": "midpoint", "num_steps": 2}
     exact: dict[str, Any] = {"canonical_time": 0.5, "solver": "rk4", "num_steps": 8}
+    skipping = SkippingFlow(FlowDeformation(network(), **frozen), BOX)
+    skipping.motion[:, :, : skipping.motion.shape[2] // 2] = 0
     return {
         "displacement (3 x 64)": DisplacementDeformation(
             3, 64, (), position_frequencies=3, time_frequencies=5, canonical_time=None
@@ -153,6 +162,7 @@ def variants() -> dict[str, Deformation]:
         "flow, frozen clock, 1 midpoint step (3 x 48)": FlowDeformation(network(hidden_features=48), **frozen),
         "flow, frozen clock, 1 midpoint step (2 x 64)": FlowDeformation(network(num_layers=2), **frozen),
         "flow, frozen clock, 1 midpoint step, grid 16^3 x 17": FlowDeformation(GridVelocity(BOX), **frozen),
+        "flow, frozen clock, 1 midpoint step (3 x 64), lower half still and skipped": skipping,
         "flow, running clock, 2 midpoint steps (3 x 64)": FlowDeformation(network(), **running),
         "flow, running clock, 2 midpoint steps, grid 16^3 x 17": FlowDeformation(GridVelocity(BOX), **running),
         "flow, running clock, 2 midpoint steps, curl of 64 waves": FlowDeformation(CurlVelocity(BOX), **running),
@@ -190,8 +200,8 @@ def variant_rows(
         device: where to compute.
 
     Returns:
-        Rows of variant, evaluations, vertices (integrated points; samples where there is no lattice), forward_ms,
-        training_ms (forward and backward) and ratio (of training_ms to the first row's).
+        Rows of variant, evaluations, points (integrated: samples, or vertices of a lattice), forward_ms, training_ms
+        (forward and backward) and ratio (of training_ms to the first row's).
     """
     made = variants()
     unknown = set(names) - set(made)
@@ -217,12 +227,17 @@ def variant_rows(
         with torch.no_grad():
             forward_ms = milliseconds(forward, repeats)
         training_ms = milliseconds(step, repeats)
-        flow = deformation.flow if isinstance(deformation, LatticeFlow) else deformation
+        flow = deformation.flow if isinstance(deformation, LatticeFlow | SkippingFlow) else deformation
+        points = num_samples
+        if isinstance(deformation, LatticeFlow):
+            points = deformation.num_vertices
+        elif isinstance(deformation, SkippingFlow):
+            points = deformation.num_integrated
         rows.append(
             {
                 "variant": name,
                 "evaluations": flow.evaluations.last if isinstance(flow, FlowDeformation) else 1,
-                "vertices": deformation.num_vertices if isinstance(deformation, LatticeFlow) else num_samples,
+                "points": points,
                 "forward_ms": forward_ms,
                 "training_ms": training_ms,
                 "ratio": training_ms / (rows[0]["training_ms"] if rows else training_ms),

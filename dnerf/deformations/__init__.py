@@ -6,6 +6,7 @@ from dnerf.deformations.fixed_point import invert
 from dnerf.deformations.flow import FlowDeformation
 from dnerf.deformations.identity import IdentityDeformation
 from dnerf.deformations.lattice_flow import LatticeFlow
+from dnerf.deformations.skipping_flow import SkippingFlow
 from dnerf.deformations.solvers import IntegrationError
 
 __all__ = [
@@ -16,5 +17,6 @@ __all__ = [
     "IntegrationError",
     "InvertibleDeformation",
     "LatticeFlow",
+    "SkippingFlow",
     "invert",
 ]

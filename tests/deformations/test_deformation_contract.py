@@ -13,6 +13,7 @@ from dnerf.deformations import (
     IdentityDeformation,
     InvertibleDeformation,
     LatticeFlow,
+    SkippingFlow,
 )
 from dnerf.deformations.velocities import CurlVelocity, GridVelocity, NetworkVelocity, RigidVelocity
 
@@ -40,6 +41,7 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
     "flow, curl": lambda: FlowDeformation(CurlVelocity(BOX, 4, 8, max_wavenumber=0.5, time_frequencies=2), num_steps=4),
     "flow, rigid": lambda: FlowDeformation(RigidVelocity(BOX, 3, 8, time_frequencies=2), num_steps=4),
     "flow on a lattice": lambda: LatticeFlow(FlowDeformation(network_velocity(), num_steps=2), BOX, 9, 5, pad_to=64),
+    "flow that skips": lambda: SkippingFlow(FlowDeformation(network_velocity(), num_steps=4), BOX, 4, pad_to=16),
 }
 INVERTIBLE = [name for name, make in DEFORMATIONS.items() if isinstance(make(), InvertibleDeformation)]
 TRAINABLE = [name for name, make in DEFORMATIONS.items() if list(make().parameters())]
