@@ -74,7 +74,11 @@ def carry(
             guess = positions if guess is None else guess
             return _carry_by_fixed_point(model, canonical, before, after, positions, guess)
         moved = model.inverse(canonical, after)
-        return moved, (model(moved, after) - canonical).norm(dim=-1)
+        residual = (model(moved, after) - canonical).norm(dim=-1)
+        left = ~(residual < SOLVED)
+        # A flow of few coarse steps may be far from its reverse at a few points.
+        found, miss = invert(model, canonical[left], after[left], guess=moved[left], use_jacobian=True)
+        return moved.masked_scatter(left[..., None], found), residual.masked_scatter(left, miss)
 
 
 def _carry_by_fixed_point(

@@ -73,7 +73,7 @@ class FlowDeformation(InvertibleDeformation):
         atol: float = 1e-6,
         gradient: str = "direct",
         max_steps: int = 1000,
-        corrections: int = 6,
+        corrections: int = 10,
     ) -> None:
         super().__init__()
         check_choice("clock", clock, CLOCKS)
