@@ -111,6 +111,27 @@ def evaluate(
     )
 
 
+def scores_by_time(frames: Sequence[FrameScore], end: float) -> dict[str, dict[str, float | int | None]]:
+    """Mean scores up to a time ("interpolation") and after it ("extrapolation"), None where there is no frame.
+
+    Args:
+        frames: scores of frames.
+        end: last time seen in training, in [0, 1].
+    """
+    groups = {
+        "interpolation": [frame for frame in frames if frame.time <= end],
+        "extrapolation": [frame for frame in frames if frame.time > end],
+    }
+    return {
+        name: {
+            "num_frames": len(group),
+            "psnr": fmean(frame.psnr for frame in group) if group else None,
+            "ssim": fmean(frame.ssim for frame in group) if group else None,
+        }
+        for name, group in groups.items()
+    }
+
+
 def spread_indices(count: int, most: int | None) -> list[int]:
     """At most `most` of the indices below `count`, from first to last at even distances; all if None.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from torch import Tensor
 
 from dnerf.data import DataSource
-from dnerf.evaluation import FrameScore, evaluate, spread_indices
+from dnerf.evaluation import FrameScore, evaluate, scores_by_time, spread_indices
 from dnerf.files import write_json
 from dnerf.logs import SHEET_COLUMNS
 from dnerf.renderer import Renderer
@@ -41,10 +41,10 @@ def evaluate_run(
             rows.append([prediction, truth, error_map(prediction, truth)])
             labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")
 
-    metrics = {
-        **evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep).as_dict(),
-        **training,
-    }
+    evaluation = evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep)
+    metrics = {**evaluation.as_dict(), **training}
+    if data.train_end is not None:
+        metrics |= {"train_end": data.train_end, **scores_by_time(evaluation.frames, data.train_end)}
     write_png(contact_sheet(rows, columns=SHEET_COLUMNS, rows=labels), sheet_path(folder, split))
     write_json(folder / "metrics.json", metrics)
     return metrics
@@ -79,6 +79,10 @@ def print_scores(metrics: dict[str, object], folder: Path) -> None:
     for frame in frames:
         print(f"{frame['index']:>6}  {frame['time']:>5.3f}  {frame['psnr']:>6.2f}  {frame['ssim']:>6.4f}")
     print(f"{'mean':>6}  {'':>5}  {metrics['psnr']:>6.2f}  {metrics['ssim']:>6.4f}")
+    for name in ("interpolation", "extrapolation"):
+        group = metrics.get(name)
+        if isinstance(group, dict) and group["num_frames"]:
+            print(f"{name}: {group['num_frames']} frames, {group['psnr']:.2f} dB, SSIM {group['ssim']:.4f}")
     print(
         f"{metrics['num_frames']} {metrics['split']} frames, {metrics['seconds_per_frame']:.3f} s a frame; "
         f"trained {metrics['train_seconds']:.0f} s, {metrics['num_steps']} steps, "

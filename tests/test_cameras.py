@@ -213,3 +213,22 @@ def test_fixed_path_repeats_the_pose() -> None:
 def test_bad_cameras_and_paths_are_refused(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize("pixel_origin", ["center", "corner"])
+@pytest.mark.parametrize("center", [(None, None), (7.0, 2.5)])
+def test_projection_finds_the_pixel_that_a_ray_goes_through(
+    pixel_origin: str, center: tuple[float | None, float | None]
+) -> None:
+    intrinsics = Intrinsics(12, 9, 14.0, 17.0, *center, pixel_origin=pixel_origin)
+    camera = Camera(intrinsics, some_pose(), 1.0, 3.0)
+    rays = camera.rays(0.0)
+    distances = rays.near + torch.rand(len(rays), dtype=torch.float64) * (rays.far - rays.near)
+    pixels, depth = camera.project(rays.origins + distances[:, None] * rays.directions)
+    index = torch.arange(12 * 9)
+    expected = torch.stack([index % 12, index // 12], dim=-1).double()
+    torch.testing.assert_close(pixels, expected, rtol=0, atol=1e-9)
+    # Planes are z-depths: distance over near's distance is depth over near.
+    torch.testing.assert_close(depth, distances / rays.near * camera.near)
+    _, behind = camera.project(rays.origins - rays.directions)
+    assert (behind < 0).all()

@@ -51,6 +51,18 @@ def test_config_composes_instantiates_and_takes_a_step(choice):
     assert any(not torch.equal(a, b) for a, b in zip(before, renderer.parameters()))
 
 
+@pytest.mark.parametrize("loss", names("trainer/losses"))
+def test_motion_losses_join_the_flow(loss):
+    config = composed("experiment=flow", f"+trainer/losses={loss}", "data.train_end=0.8")
+    data = instantiate(config.data, _convert_="all")
+    trainer = instantiate(config.trainer, _convert_="all")
+    assert set(trainer.losses) == {"rgb", loss}
+    terms = []
+    renderer = instantiate(config.renderer, _convert_="all")
+    trainer.fit(renderer, data.frames("train"), callbacks=[lambda record, _: terms.append(record.losses)])
+    assert set(terms[-1]) == {"loss", "rgb", loss}
+
+
 def test_every_scene_has_a_config_that_builds_it():
     for name in names("scene"):
         assert isinstance(instantiate(composed(f"scene={name}").data, _convert_="all"), SyntheticData)
@@ -70,7 +82,7 @@ def test_blender_data_reads_what_make_dataset_writes(tmp_path):
     assert difference.abs().max() <= 1
 
 
-@pytest.mark.parametrize("script", ["evaluate", "render", "make_dataset"])
+@pytest.mark.parametrize("script", ["evaluate", "render", "make_dataset", "tracks"])
 def test_script_configs_compose(script):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for path in names("path") if script == "render" else [None]:

@@ -3,7 +3,7 @@ import torch
 
 from dnerf.backgrounds import ConstantBackground
 from dnerf.data import SyntheticData
-from dnerf.evaluation import MAX_PSNR, evaluate, spread_indices
+from dnerf.evaluation import MAX_PSNR, FrameScore, evaluate, scores_by_time, spread_indices
 from dnerf.metrics import psnr, ssim
 from dnerf.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
@@ -82,3 +82,13 @@ def test_mode_is_restored(truth):
     renderer.eval()
     evaluate(renderer, frames, max_frames=1)
     assert not renderer.training
+
+
+def test_scores_are_split_at_the_last_training_time():
+    frames = [
+        FrameScore(i, time, psnr, 0.5 + 0.1 * i) for i, (time, psnr) in enumerate([(0.1, 30), (0.8, 20), (0.9, 10)])
+    ]
+    groups = scores_by_time(frames, 0.8)
+    assert groups["interpolation"] == {"num_frames": 2, "psnr": 25, "ssim": pytest.approx(0.55)}
+    assert groups["extrapolation"] == {"num_frames": 1, "psnr": 10, "ssim": pytest.approx(0.7)}
+    assert scores_by_time(frames, 1.0)["extrapolation"] == {"num_frames": 0, "psnr": None, "ssim": None}

@@ -30,19 +30,23 @@ FLOORS = {
     "data": 6,
     "losses": 6,
     "metrics": 6,
+    "motion": 6,
+    "motion_losses": 6,
     # 7: whole runs.
+    "benchmarks": 7,
     "checkpoints": 7,
     "distributed": 7,
     "evaluation": 7,
     "logs": 7,
     "report": 7,
+    "tracks": 7,
     "training": 7,
     "video": 7,
     "viewer": 7,
 }
 
 # Imports within a floor, each deliberate: `checks` is the ground of floor 0, compositing is built on its kernels,
-# logs record what training, evaluation and video make.
+# losses about motion are losses, logs record what training, evaluation and video make.
 WITHIN_A_FLOOR = {
     ("compositing", "kernels"),
     ("encodings", "checks"),
@@ -52,6 +56,8 @@ WITHIN_A_FLOOR = {
     ("logs", "training"),
     ("logs", "video"),
     ("mlp", "checks"),
+    ("motion_losses", "losses"),
+    ("tracks", "video"),
     ("rays", "checks"),
 }
 

@@ -1,5 +1,7 @@
 """The MLP against a loop over its layers, and its start."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
@@ -75,3 +77,26 @@ def test_skips_that_name_no_layer_are_refused(skips: tuple[int, ...]) -> None:
 def test_sizes_that_are_not_positive_are_refused(sizes: tuple[int, int, int], name: str) -> None:
     with pytest.raises(ValueError, match=name):
         MLP(*sizes)
+
+
+@pytest.mark.parametrize(
+    ("activation", "formula"),
+    [
+        ("relu", lambda x: x.clamp(min=0)),
+        ("silu", lambda x: x / (1 + torch.exp(-x))),
+        ("softplus", lambda x: torch.log1p(torch.exp(x))),
+    ],
+)
+def test_activation_is_its_formula(activation: str, formula: Callable[[Tensor], Tensor]) -> None:
+    mlp = MLP(3, 8, 2, out_features=2, activation=activation).double()
+    inputs = torch.randn(10, 3, dtype=torch.float64)
+    hidden = inputs
+    for layer in mlp.hidden:
+        hidden = formula(layer(hidden))
+    assert mlp.output is not None
+    torch.testing.assert_close(mlp(inputs), mlp.output(hidden))
+
+
+def test_unknown_activation_is_refused() -> None:
+    with pytest.raises(ValueError, match="activation must be one of relu, silu, softplus; got 'tanh'"):
+        MLP(3, 5, 4, activation="tanh")

@@ -19,6 +19,7 @@ class DataSource(ABC):
     """Frames of a scene by split, and the box its matter lies in."""
 
     box: Tensor  # (2, 3), in world units
+    train_end: float | None = None  # last time that training frames may have; None for all
 
     @abstractmethod
     def frames(self, split: str) -> Frames:
@@ -27,6 +28,24 @@ class DataSource(ABC):
         Raises:
             ValueError: for another split or broken data.
         """
+
+    def _known(self, frames: Frames, split: str) -> Frames:
+        """The frames of a split that may be seen: training frames up to `train_end`, all others whole.
+
+        Raises:
+            ValueError: if no training frame is left.
+        """
+        if split != "train" or self.train_end is None:
+            return frames
+        kept = (frames.times <= self.train_end).nonzero()[:, 0].tolist()
+        if not kept:
+            raise ValueError(f"train_end must leave a training frame, got {self.train_end}, the first is later")
+        return frames.subset(kept)
+
+
+def _check_train_end(train_end: float | None) -> None:
+    if train_end is not None and not 0 <= train_end <= 1:
+        raise ValueError(f"train_end must be in [0, 1] or None, got {train_end}")
 
 
 class BlenderData(DataSource):
@@ -39,6 +58,10 @@ class BlenderData(DataSource):
         near: z-depth where rays begin; None takes what the file says, 2 if nothing.
         far: z-depth where they end; None takes what the file says, 6 if nothing.
         pixel_origin: "center", or "corner" as D-NeRF's code; None takes what the file says, "center" if nothing.
+        train_end: train on frames up to this time only, for extrapolation; None for all.
+
+    Raises:
+        ValueError: for a box that is none or a time outside [0, 1].
     """
 
     def __init__(
@@ -50,7 +73,10 @@ class BlenderData(DataSource):
         near: float | None = None,
         far: float | None = None,
         pixel_origin: str | None = None,
+        train_end: float | None = None,
     ) -> None:
+        _check_train_end(train_end)
+        self.train_end = train_end
         self.root = root
         self.resolution = resolution
         self.box = as_box(box)
@@ -61,9 +87,10 @@ class BlenderData(DataSource):
     def frames(self, split: str) -> Frames:
         """Read a split; see `load_blender` for what can be wrong with it."""
         check_choice("split", split, SPLITS)
-        return load_blender(
+        frames = load_blender(
             self.root, split, self.resolution, near=self.near, far=self.far, pixel_origin=self.pixel_origin
         )
+        return self._known(frames, split)
 
 
 class SyntheticData(DataSource):
@@ -80,9 +107,11 @@ class SyntheticData(DataSource):
         num_test: frames of the test split.
         seed: of the random views.
         background: colour behind the frames, which have no alpha then; None keeps alpha.
+        train_end: train on frames up to this time only, for extrapolation; None for all.
 
     Raises:
-        ValueError: if resolution or a number of frames is not positive, or the box or colour is none.
+        ValueError: if resolution or a number of frames is not positive, the box or colour is none, or a time lies
+            outside [0, 1].
     """
 
     def __init__(
@@ -96,7 +125,9 @@ class SyntheticData(DataSource):
         num_test: int = 20,
         seed: int = 0,
         background: str | Sequence[float] | None = None,
+        train_end: float | None = None,
     ) -> None:
+        _check_train_end(train_end)
         for name, value in (
             ("resolution", resolution),
             ("num_train", num_train),
@@ -104,6 +135,7 @@ class SyntheticData(DataSource):
             ("num_test", num_test),
         ):
             check_positive(name, value)
+        self.train_end = train_end
         self.scene = scene
         self.resolution = resolution
         self.box = as_box(box)
@@ -117,4 +149,4 @@ class SyntheticData(DataSource):
         poses, times = random_views(
             self.num_frames[split], midway=split != "train", seed=self.seed + 1000 * SPLITS.index(split)
         )
-        return render_frames(self.scene, poses, times, self.resolution, background=self.background)
+        return self._known(render_frames(self.scene, poses, times, self.resolution, background=self.background), split)

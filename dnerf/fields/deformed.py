@@ -12,8 +12,8 @@ from dnerf.fields.base import RadianceField
 class DeformedField(RadianceField):
     """The canonical field at deformed positions: (density, rgb)(x, d, t) = canonical(deformation(x, t), d, t).
 
-    Viewing directions are not turned by the deformation (as in D-NeRF). Its output carries the extra
-    "canonical_positions" (..., 3).
+    Viewing directions are not turned by the deformation (as in D-NeRF). Its output carries the extras
+    "canonical_positions" (..., 3), and "positions" (..., 3) and "times" (...,) as they came.
 
     Args:
         deformation: world -> canonical.
@@ -33,4 +33,5 @@ class DeformedField(RadianceField):
         """Density (...,) and rgb (..., 3) at positions (..., 3), directions (..., 3) and times (...,)."""
         canonical_positions = self.deformation(positions, times)
         output = self.canonical(canonical_positions, directions, times)
-        return replace(output, extras={**output.extras, "canonical_positions": canonical_positions})
+        extras = {"canonical_positions": canonical_positions, "positions": positions, "times": times}
+        return replace(output, extras={**output.extras, **extras})

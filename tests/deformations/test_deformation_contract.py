@@ -9,9 +9,20 @@ from torch import Tensor
 from dnerf.deformations import (
     Deformation,
     DisplacementDeformation,
+    FlowDeformation,
     IdentityDeformation,
     InvertibleDeformation,
+    LatticeFlow,
+    SkippingFlow,
 )
+from dnerf.deformations.velocities import CurlVelocity, GridVelocity, NetworkVelocity, RigidVelocity
+
+BOX = ((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
+
+
+def network_velocity() -> NetworkVelocity:
+    return NetworkVelocity(BOX, 2, 16, position_frequencies=1, time_frequencies=2)
+
 
 # Small networks: the contract does not depend on the width.
 DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
@@ -20,6 +31,17 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
     "displacement, no canonical time": lambda: DisplacementDeformation(2, 16, (), canonical_time=None),
     "displacement, canonical time 0.5": lambda: DisplacementDeformation(2, 16, (), canonical_time=0.5),
     "displacement, windowed": lambda: DisplacementDeformation(2, 16, (), window_end=0.5),
+    "flow": lambda: FlowDeformation(network_velocity(), 0.5),
+    "flow, adjoint": lambda: FlowDeformation(network_velocity(), num_steps=4, gradient="adjoint"),
+    "flow, frozen clock": lambda: FlowDeformation(
+        network_velocity(), None, clock="frozen", solver="midpoint", num_steps=1
+    ),
+    "flow, grid": lambda: FlowDeformation(GridVelocity(BOX, 3, 5), num_steps=4),
+    "flow, grid and network": lambda: FlowDeformation(GridVelocity(BOX, 3, 5, hidden_features=8), num_steps=4),
+    "flow, curl": lambda: FlowDeformation(CurlVelocity(BOX, 4, 8, max_wavenumber=0.5, time_frequencies=2), num_steps=4),
+    "flow, rigid": lambda: FlowDeformation(RigidVelocity(BOX, 3, 8, time_frequencies=2), num_steps=4),
+    "flow on a lattice": lambda: LatticeFlow(FlowDeformation(network_velocity(), num_steps=2), BOX, 9, 5, pad_to=64),
+    "flow that skips": lambda: SkippingFlow(FlowDeformation(network_velocity(), num_steps=4), BOX, 4, pad_to=16),
 }
 INVERTIBLE = [name for name, make in DEFORMATIONS.items() if isinstance(make(), InvertibleDeformation)]
 TRAINABLE = [name for name, make in DEFORMATIONS.items() if list(make().parameters())]

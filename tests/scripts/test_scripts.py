@@ -172,3 +172,19 @@ def test_checkpoint_that_does_not_fit_is_refused(trained, tmp_path):
     assert done.returncode == 2
     assert "model.safetensors" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_tracks_of_a_flow_are_followed_drawn_and_measured(tmp_path):
+    done = run_script(
+        "train", "experiment=flow", "data=synthetic", "data.train_end=0.5", *TINY, "out_dir=run", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert "extrapolation: " in done.stdout
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    counts = [metrics[name]["num_frames"] for name in ("interpolation", "extrapolation")]
+    assert metrics["train_end"] == 0.5
+    assert counts == [1, 1]
+    # So untrained a picture is thin everywhere: no point is seen, which is said in one line.
+    done = run_script("tracks", "run=run", "num_frames=2", "spacing=6", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1].startswith("error: time 0.0: the picture shows no matter")

@@ -1,0 +1,1 @@
+"""Measurements: functions that return rows of a table."""

@@ -1,0 +1,179 @@
+"""Losses that a flow makes natural, each optional: smooth, slow to change, volume-keeping, cycle-consistent motion.
+
+They look at some of a batch's own samples, weighted by their share in the picture: motion of empty space is free.
+Derivatives in space and time are finite differences, since compiled kernels are differentiable once.
+"""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dnerf.checks import check_positive
+from dnerf.compositing import Rendering
+from dnerf.deformations import FlowDeformation, LatticeFlow, SkippingFlow
+from dnerf.fields import DeformedField
+from dnerf.losses import Loss
+from dnerf.renderer import Renderer
+
+
+@dataclass(frozen=True)
+class MotionPoints:
+    """Samples of a batch at which motion is judged.
+
+    Args:
+        positions: (M, 3) in world units, without gradient.
+        times: (M,).
+        shares: (M,) summing to 1 (to 0 if the picture shows nothing), without gradient.
+    """
+
+    positions: Tensor
+    times: Tensor
+    shares: Tensor
+
+
+class MotionLoss(Loss):
+    """A term about the motion of a flow, `weight` times the mean over points, weighted by their shares.
+
+    Args:
+        weight: factor of the term.
+        num_points: at most so many samples of each batch are looked at, evenly spread over it.
+
+    Raises:
+        ValueError: for a negative weight or no points; when used, for a renderer whose deformation is no flow.
+    """
+
+    def __init__(self, weight: float, num_points: int = 1024) -> None:
+        super().__init__()
+        check_positive("weight", weight, allow_zero=True)
+        check_positive("num_points", num_points)
+        self.weight = weight
+        self.num_points = num_points
+
+    def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
+        """The weighted mean of `penalty`."""
+        flow = self._flow(renderer)
+        points = self._points(rendering)
+        return self.weight * (points.shares * self.penalty(flow, points)).sum()
+
+    @abstractmethod
+    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
+        """What is wrong at each point, (M,)."""
+
+    def _flow(self, renderer: Renderer) -> FlowDeformation:
+        deformation = renderer.field.deformation if isinstance(renderer.field, DeformedField) else None
+        if isinstance(deformation, LatticeFlow | SkippingFlow):
+            deformation = deformation.flow
+        if not isinstance(deformation, FlowDeformation):
+            raise ValueError(
+                f"{type(self).__name__} needs a renderer whose deformation is a flow, got {type(deformation).__name__}"
+            )
+        return deformation
+
+    def _points(self, rendering: Rendering) -> MotionPoints:
+        assert rendering.output is not None
+        assert rendering.weights is not None
+        positions = rendering.output.extras["positions"].detach().reshape(-1, 3)
+        every = max(1, -(-len(positions) // self.num_points))
+        weights = rendering.weights.detach().reshape(-1)[::every]
+        shares = weights / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny)
+        return MotionPoints(positions[::every], rendering.output.extras["times"].reshape(-1)[::every], shares)
+
+
+class SmoothVelocityLoss(MotionLoss):
+    """Squared spatial change of the velocity, |grad v|^2 = sum_ij (dv_i / dx_j)^2, in 1 / time^2.
+
+    Args:
+        weight: factor of the term.
+        num_points: see `MotionLoss`.
+        distance: of the forward differences, in world units.
+    """
+
+    def __init__(self, weight: float = 1e-4, num_points: int = 1024, *, distance: float = 0.02) -> None:
+        super().__init__(weight, num_points)
+        check_positive("distance", distance)
+        self.distance = distance
+
+    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
+        """Squared Frobenius norm of the velocity's gradient."""
+        velocity = flow.velocity.at(points.times)
+        here = velocity(points.positions)
+        changes = [velocity(points.positions + step) - here for step in _steps(points.positions, self.distance)]
+        return torch.stack(changes).square().sum((0, -1)) / self.distance**2
+
+
+class DivergenceLoss(MotionLoss):
+    """Squared divergence of the velocity, (div v)^2 in 1 / time^2: matter should keep its volume.
+
+    Args:
+        weight: factor of the term.
+        num_points: see `MotionLoss`.
+        distance: half the span of the central differences, in world units.
+    """
+
+    def __init__(self, weight: float = 1e-4, num_points: int = 1024, *, distance: float = 0.02) -> None:
+        super().__init__(weight, num_points)
+        check_positive("distance", distance)
+        self.distance = distance
+
+    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
+        """Squared trace of the velocity's gradient."""
+        velocity = flow.velocity.at(points.times)
+        divergence = torch.zeros_like(points.times)
+        for axis, step in enumerate(_steps(points.positions, self.distance)):
+            change = velocity(points.positions + step) - velocity(points.positions - step)
+            divergence = divergence + change[:, axis] / (2 * self.distance)
+        return divergence.square()
+
+
+class AccelerationLoss(MotionLoss):
+    """Squared acceleration of matter along its track, |d^2 x / dt^2|^2 in world units^2 / time^4.
+
+    Central differences of where one canonical point is at three times, so it is the acceleration of material points
+    whatever the flow's clock is.
+
+    Args:
+        weight: factor of the term.
+        num_points: see `MotionLoss`.
+        interval: between the three times, in (0, 0.5].
+    """
+
+    def __init__(self, weight: float = 1e-5, num_points: int = 512, *, interval: float = 0.02) -> None:
+        super().__init__(weight, num_points)
+        check_positive("interval", interval)
+        if interval > 0.5:
+            raise ValueError(f"interval must be in (0, 0.5], got {interval}")
+        self.interval = interval
+
+    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
+        """Squared second difference of the track."""
+        canonical = flow(points.positions, points.times)
+        middle = points.times.clamp(self.interval, 1 - self.interval)
+        moments = torch.cat([middle - self.interval, middle, middle + self.interval])
+        before, here, after = flow.reverse(canonical.repeat(3, 1), moments).chunk(3)
+        return (before - 2 * here + after).square().sum(-1) / self.interval**4
+
+
+class CycleConsistencyLoss(MotionLoss):
+    """Squared distance between points and where they come back to, world -> canonical -> world, in world units^2.
+
+    Zero for an exact flow: it penalises fields that the solver's few steps cannot follow.
+
+    Args:
+        weight: factor of the term.
+        num_points: see `MotionLoss`.
+    """
+
+    def __init__(self, weight: float = 1.0, num_points: int = 1024) -> None:
+        super().__init__(weight, num_points)
+
+    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
+        """Squared distance after the round trip by the uncorrected inverse."""
+        back = flow.reverse(flow(points.positions, points.times), points.times)
+        return (back - points.positions).square().sum(-1)
+
+
+def _steps(like: Tensor, distance: float) -> Tensor:
+    """Steps (3, 3) of a length along each axis."""
+    return distance * torch.eye(3, dtype=like.dtype, device=like.device)

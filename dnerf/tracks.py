@@ -1,0 +1,130 @@
+"""Pictures of tracks: material points drawn with their trails over a rendered sequence."""
+
+import colorsys
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from dnerf.cameras import Camera
+from dnerf.checks import check_positive, check_shape
+from dnerf.motion import Trajectories, follow, motion_model
+from dnerf.renderer import Renderer
+from dnerf.video import to_uint8
+
+SUPERSAMPLING = 3
+"""Trails are drawn so much larger and scaled down, since Pillow's lines have no smooth edges."""
+
+
+def seen_points(renderer: Renderer, camera: Camera, time: float, spacing: int, *, chunk: int = 16384) -> Tensor:
+    """Points (P, 3) on the matter that every `spacing`-th pixel of every `spacing`-th row shows.
+
+    Raises:
+        ValueError: if the picture shows no matter there.
+    """
+    check_positive("spacing", spacing)
+    rendering = renderer.render_image(camera, time, chunk=chunk)
+    rays = camera.rays(time)
+    points = torch.addcmul(rays.origins, rendering.depth.reshape(-1, 1), rays.directions)
+    points = points.reshape(*rendering.depth.shape, 3)
+    rows = slice(spacing // 2, None, spacing)
+    chosen = points[rows, rows][rendering.opacity[rows, rows] > 0.9]
+    if not len(chosen):
+        raise ValueError(
+            f"time {time}: the picture shows no matter at a spacing of {spacing} pixels; take a smaller one"
+        )
+    return chosen
+
+
+def draw_tracks(
+    image: Tensor, pixels: Tensor, visible: Tensor, colors: Sequence[tuple[int, int, int]], *, width: float = 1.5
+) -> Tensor:
+    """Draw points with their trails.
+
+    Args:
+        image: (H, W, 3) float in [0, 1] or uint8.
+        pixels: (T, P, 2) columns and rows of P points at T times, the last one now; whole numbers are pixel centres.
+        visible: (P,) bool, whether a point is seen now; the others are left out.
+        colors: P colours, 0 to 255.
+        width: of the trails, in pixels.
+
+    Returns:
+        (H, W, 3) uint8.
+
+    Raises:
+        ValueError: for shapes that do not fit.
+    """
+    check_shape("pixels", pixels, ("T", "P", 2))
+    check_shape("visible", visible, (pixels.shape[1],))
+    if len(colors) != pixels.shape[1]:
+        raise ValueError(f"colors must be {pixels.shape[1]}, one per point, got {len(colors)}")
+    picture = Image.fromarray(to_uint8(image).cpu().numpy())
+    size = picture.size
+    picture = picture.resize((size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING), Image.Resampling.BICUBIC)
+    draw = ImageDraw.Draw(picture)
+    line, radius = max(1, round(width * SUPERSAMPLING)), 1.2 * width * SUPERSAMPLING
+    trails = ((pixels.cpu().double() + 0.5) * SUPERSAMPLING).transpose(0, 1)
+    for trail, shown, color in zip(trails.tolist(), visible.tolist(), colors):
+        if not shown or not np.isfinite(trail).all():
+            continue
+        draw.line([(x, y) for x, y in trail], fill=color, width=line, joint="curve")
+        x, y = trail[-1]
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=color)
+    return torch.from_numpy(np.array(picture.resize(size, Image.Resampling.LANCZOS)))
+
+
+def track_colors(points: Tensor) -> list[tuple[int, int, int]]:
+    """A colour for each of P points (P, 3), its hue by height and its lightness by side."""
+    low, high = points.amin(0), points.amax(0)
+    unit = ((points - low) / (high - low).clamp(min=1e-6)).tolist()
+    return [
+        tuple(round(255 * channel) for channel in colorsys.hls_to_rgb(0.83 * z, 0.35 + 0.3 * x, 0.9))  # type: ignore[misc]
+        for x, _, z in unit
+    ]
+
+
+def render_tracks(
+    renderer: Renderer,
+    camera: Camera,
+    points: Tensor,
+    time: float,
+    times: Sequence[float],
+    *,
+    trail: int = 12,
+    tolerance: float = 0.08,
+    chunk: int = 16384,
+) -> tuple[Trajectories, Iterator[Tensor]]:
+    """Follow points and draw them over pictures of a sequence.
+
+    Args:
+        renderer: the model.
+        camera: the view, on the model's device.
+        points: (P, 3) in world units, at `time`.
+        time: in [0, 1].
+        times: of the sequence's pictures, each in [0, 1].
+        trail: earlier pictures of the sequence that a trail reaches back.
+        tolerance: distance behind the picture's surface at which a point counts as hidden, in world units.
+        chunk: rays at a time.
+
+    Returns:
+        The tracks, and an iterator over pictures (H, W, 3) uint8, rendered as they are asked for.
+    """
+    moments = torch.tensor(list(times), dtype=points.dtype, device=points.device)
+    tracks = follow(motion_model(renderer), points, time, moments)
+    pixels, depths = camera.project(tracks.positions)
+    colors = track_colors(points)
+
+    def pictures() -> Iterator[Tensor]:
+        size = torch.tensor([camera.intrinsics.width, camera.intrinsics.height], device=points.device)
+        for i, moment in enumerate(times):
+            rendering = renderer.render_image(camera, float(moment), chunk=chunk)
+            nearest = torch.where(depths[i, :, None] > 0, pixels[i], -1.0).round().long()
+            inside = ((nearest >= 0) & (nearest < size)).all(-1)
+            columns, rows = torch.where(inside[:, None], nearest, 0).unbind(-1)
+            distance = (tracks.positions[i] - camera.pose[:3, 3]).norm(dim=-1)
+            visible = inside & (distance < rendering.depth[rows, columns] + tolerance)
+            yield draw_tracks(rendering.rgb, pixels[max(0, i - trail) : i + 1], visible, colors)
+
+    return tracks, pictures()

@@ -1,0 +1,237 @@
+"""The flow: round trips, Jacobians, gradients, composition, determinism."""
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.benchmarks.closed_flows import Rotation, Swirl
+from dnerf.deformations import DisplacementDeformation, FlowDeformation
+from dnerf.deformations.velocities import NetworkVelocity
+
+BOX = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+
+
+def points(count: int, dtype: torch.dtype = torch.float32, seed: int = 2) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    positions = torch.rand(count, 3, generator=generator, dtype=dtype) * 2 - 1
+    return positions, torch.rand(count, generator=generator, dtype=dtype)
+
+
+def fit(steps: int = 150) -> tuple[FlowDeformation, list[float]]:
+    """A network flow trained by its displacements of points to follow a swirl."""
+    torch.manual_seed(0)
+    velocity = NetworkVelocity(BOX, 2, 32, position_frequencies=1, time_frequencies=2)
+    flow = FlowDeformation(velocity, 0.0, solver="midpoint", num_steps=4)
+    truth = Swirl(1.0, 3.0)
+    optimizer = torch.optim.Adam(flow.parameters(), lr=1e-2)
+    losses = []
+    for step in range(steps):
+        positions, times = points(256, seed=100 + step)
+        target = truth.carry(positions, times, 0 * times)
+        loss = (flow(positions, times) - target).square().sum(-1).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    return flow, losses
+
+
+@pytest.fixture(scope="module")
+def velocity() -> NetworkVelocity:
+    flow, losses = fit()
+    # It has learnt: points move by about half a unit, and miss by a tenth of that.
+    assert losses[-1] < 0.1**2 * 0.5
+    return flow.velocity
+
+
+def flow_of(velocity: NetworkVelocity, dtype: torch.dtype = torch.float32, **arguments: object) -> FlowDeformation:
+    arguments = {"solver": "rk4", "num_steps": 8, **arguments}
+    return FlowDeformation(copy.deepcopy(velocity).to(dtype), **arguments)
+
+
+@pytest.mark.parametrize("clock", ["running", "frozen"])
+def test_round_trip_of_a_trained_field_in_float32(velocity: NetworkVelocity, clock: str) -> None:
+    flow = flow_of(velocity, canonical_time=0.0, clock=clock)
+    positions, times = points(2000)
+    canonical = flow(positions, times)
+    assert (canonical - positions).norm(dim=-1).mean() > 0.1
+    # The target of the project; rounding alone is a few 1e-7 for coordinates up to 1.5.
+    torch.testing.assert_close(flow.inverse(canonical, times), positions, rtol=0, atol=1e-6)
+    torch.testing.assert_close(flow(flow.inverse(positions, times), times), positions, rtol=0, atol=1e-6)
+
+
+def test_reverse_without_corrections_misses_by_the_solvers_error_only(velocity: NetworkVelocity) -> None:
+    positions, times = points(500, torch.float64)
+    misses = []
+    for steps in (4, 8, 16):
+        flow = flow_of(velocity, torch.float64, num_steps=steps)
+        misses.append((flow.reverse(flow(positions, times), times) - positions).abs().max().item())
+    # Order four or five: each halving of the step gains at least a factor of ten.
+    assert misses[0] > 10 * misses[1] > 100 * misses[2]
+
+
+def test_corrections_invert_few_coarse_steps(velocity: NetworkVelocity) -> None:
+    positions, times = points(500)
+    plain, corrected = (
+        flow_of(velocity, solver="midpoint", num_steps=2, corrections=corrections) for corrections in (0, 10)
+    )
+    canonical = plain(positions, times)
+    assert (plain.inverse(canonical, times) - positions).abs().max() > 1e-3
+    torch.testing.assert_close(corrected.inverse(canonical, times), positions, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("clock", "solver", "steps"), [("running", "rk4", 8), ("frozen", "midpoint", 1)])
+def test_jacobian_determinant_stays_positive(velocity: NetworkVelocity, clock: str, solver: str, steps: int) -> None:
+    flow = flow_of(velocity, torch.float64, clock=clock, solver=solver, num_steps=steps)
+    positions, times = points(500, torch.float64)
+    assert determinants(flow, positions, times).min() > 0.05
+
+
+def determinants(flow: torch.nn.Module, positions: Tensor, times: Tensor) -> Tensor:
+    positions = positions.clone().requires_grad_()
+    moved = flow(positions, times)
+    rows = [torch.autograd.grad(moved[:, i].sum(), positions, retain_graph=True)[0] for i in range(3)]
+    return torch.linalg.det(torch.stack(rows, dim=-2))
+
+
+def test_jacobian_determinant_of_a_closed_flow_is_exact() -> None:
+    positions, times = points(20, torch.float64)
+    flow = FlowDeformation(Rotation(), 0.0, num_steps=32)
+    torch.testing.assert_close(determinants(flow, positions, times), torch.ones_like(times), rtol=0, atol=1e-5)
+
+
+def test_motion_composes_whatever_the_way(velocity: NetworkVelocity) -> None:
+    flow = flow_of(velocity, torch.float64)
+    positions, first = points(50, torch.float64)
+    second, third = 1 - first, first.square()
+    there = flow.inverse(flow(positions, first), second)
+    on = flow.inverse(flow(there, second), third)
+    torch.testing.assert_close(on, flow.inverse(flow(positions, first), third), rtol=0, atol=1e-9)
+
+
+def test_canonical_time_is_the_identity(velocity: NetworkVelocity) -> None:
+    positions, _ = points(50)
+    for canonical_time in (0.0, 0.5, 1.0):
+        for clock in ("running", "frozen"):
+            flow = flow_of(velocity, canonical_time=canonical_time, clock=clock)
+            times = torch.full((50,), canonical_time)
+            assert torch.equal(flow(positions, times), positions)
+
+
+def test_frozen_and_running_clocks_agree_where_the_velocity_does_not_change() -> None:
+    positions, times = points(50, torch.float64)
+    running, frozen = (FlowDeformation(Rotation(), 0.3, clock=clock, num_steps=32) for clock in ("running", "frozen"))
+    torch.testing.assert_close(running(positions, times), frozen(positions, times), rtol=0, atol=1e-12)
+
+
+def test_one_frozen_euler_step_is_a_displacement() -> None:
+    torch.manual_seed(1)
+    velocity = NetworkVelocity(BOX)
+    torch.nn.init.normal_(velocity.mlp.output.weight)
+    positions, times = points(50)
+    displaced = FlowDeformation(velocity, None, clock="frozen", solver="euler", num_steps=1)(positions, times)
+    assert torch.equal(displaced, positions + velocity(positions, times))
+
+
+def test_points_outside_the_box_stay_and_none_leaves_it(velocity: NetworkVelocity) -> None:
+    flow = flow_of(velocity)
+    positions = 4 * torch.rand(1000, 3) - 2
+    times = torch.rand(1000)
+    moved = flow(positions * 1.5, times)
+    outside = (1.5 * positions).abs().amax(-1) >= 2
+    assert torch.equal(moved[outside], 1.5 * positions[outside])
+    assert moved[~outside].abs().max() <= 2
+
+
+def objective(flow: FlowDeformation, positions: Tensor, times: Tensor) -> Tensor:
+    return (flow(positions, times) * torch.tensor([1.0, -2.0, 0.5], dtype=positions.dtype)).square().sum()
+
+
+def gradients(flow: FlowDeformation, positions: Tensor, times: Tensor) -> list[Tensor]:
+    positions, times = positions.clone().requires_grad_(), times.clone().requires_grad_()
+    return list(torch.autograd.grad(objective(flow, positions, times), [positions, times, *flow.parameters()]))
+
+
+@pytest.mark.parametrize("clock", ["running", "frozen"])
+@pytest.mark.parametrize(("solver", "steps"), [("rk4", 16), ("midpoint", 256), ("dopri5", 1)])
+def test_direct_and_adjoint_gradients_agree(velocity: NetworkVelocity, clock: str, solver: str, steps: int) -> None:
+    positions, times = points(6, torch.float64)
+    settings = {"clock": clock, "solver": solver, "num_steps": steps, "rtol": 1e-8, "atol": 1e-9}
+    direct = gradients(flow_of(velocity, torch.float64, **settings), positions, times)
+    adjoint = gradients(flow_of(velocity, torch.float64, gradient="adjoint", **settings), positions, times)
+    for one, other in zip(direct, adjoint):
+        # The adjoint is the exact equation's gradient, the direct one the discrete map's: they differ by its error.
+        torch.testing.assert_close(one, other, rtol=2e-3, atol=2e-4 * float(one.abs().max()))
+
+
+@pytest.mark.parametrize("gradient", ["direct", "adjoint"])
+@pytest.mark.parametrize("clock", ["running", "frozen"])
+def test_gradients_agree_with_finite_differences(velocity: NetworkVelocity, clock: str, gradient: str) -> None:
+    positions, times = points(4, torch.float64)
+    times = 0.2 + 0.6 * times
+    flow = flow_of(velocity, torch.float64, clock=clock, gradient=gradient, num_steps=16)
+    found = gradients(flow, positions, times)
+    generator = torch.Generator().manual_seed(0)
+    step = 1e-5
+    for index, gradient_ in enumerate(found):
+        direction = torch.randn(gradient_.shape, generator=generator, dtype=torch.float64)
+        values = []
+        for sign in (1, -1):
+            moved = [positions.clone(), times.clone(), *flow.parameters()]
+            with torch.no_grad():
+                moved[index] += sign * step * direction
+                values.append(float(objective(flow, moved[0], moved[1])))
+                moved[index] -= sign * step * direction
+        slope = (values[0] - values[1]) / (2 * step)
+        # Central differences are good to 1e-8; the adjoint differs by the solver's error.
+        assert abs(slope - float((gradient_ * direction).sum())) < 2e-4 * (1 + abs(slope))
+
+
+def test_gradcheck_of_the_inverse(velocity: NetworkVelocity) -> None:
+    flow = flow_of(velocity, torch.float64, num_steps=4)
+    canonical, times = points(2, torch.float64)
+    assert torch.autograd.gradcheck(flow.inverse, (canonical.requires_grad_(), times.requires_grad_()), atol=1e-5)
+
+
+def test_same_seed_gives_the_same_losses() -> None:
+    first, second = fit(5)[1], fit(5)[1]
+    assert first == second
+
+
+def test_float32_agrees_with_float64(velocity: NetworkVelocity) -> None:
+    positions, times = points(200)
+    single = flow_of(velocity)(positions, times)
+    double = flow_of(velocity, torch.float64)(positions.double(), times.double())
+    # 32 evaluations of a network in float32.
+    torch.testing.assert_close(single.double(), double, rtol=0, atol=5e-6)
+
+
+def test_the_displacement_has_no_such_guarantee() -> None:
+    """What the flow is for: a displacement may fold space where the flow of the same network does not."""
+    torch.manual_seed(3)
+    displacement = DisplacementDeformation(2, 32, (), position_frequencies=2, canonical_time=None).double()
+    torch.nn.init.normal_(displacement.mlp.output.weight, std=0.4)
+    positions, times = points(500, torch.float64)
+    assert determinants(displacement, positions, times).min() < 0
+    velocity = NetworkVelocity(BOX, 2, 32, position_frequencies=2).double()
+    torch.nn.init.normal_(velocity.mlp.output.weight, std=0.4)
+    flow = FlowDeformation(velocity, None, clock="frozen", solver="rk4", num_steps=64)
+    assert (flow(positions, times) - positions).norm(dim=-1).mean() > 0.3
+    assert determinants(flow, positions, times).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"canonical_time": None}, "canonical_time must be a time in"),
+        ({"canonical_time": 1.5}, r"canonical_time must be in \[0, 1\] or None, got 1.5"),
+        ({"clock": "stopped"}, "clock must be one of running, frozen"),
+        ({"corrections": -1}, "corrections must be >= 0"),
+        ({"solver": "magic"}, "solver must be one of"),
+    ],
+)
+def test_bad_settings_are_refused(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FlowDeformation(Rotation(), **arguments)

@@ -1,0 +1,242 @@
+"""What every velocity field must do, and what each promises: no divergence, rigid motion, smoothness."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.deformations.velocities import (
+    BoxWindow,
+    CurlVelocity,
+    GridVelocity,
+    NetworkVelocity,
+    RigidVelocity,
+    Velocity,
+)
+from dnerf.deformations.velocities.base import smooth_step_coefficients
+
+BOX = ((-1.0, -2.0, -1.5), (1.0, 2.0, 0.5))
+VELOCITIES: dict[str, Callable[[], Velocity]] = {
+    "network": lambda: NetworkVelocity(BOX, 2, 16),
+    "network, relu": lambda: NetworkVelocity(BOX, 1, 16, activation="relu", smoothness=1),
+    "grid": lambda: GridVelocity(BOX, 4, 5),
+    "grid and network": lambda: GridVelocity(BOX, 4, 5, hidden_features=8),
+    "curl": lambda: CurlVelocity(BOX, 8, 16),
+    "rigid": lambda: RigidVelocity(BOX, 4, 16),
+}
+SMOOTH = ("network", "curl", "rigid")
+every_velocity = pytest.mark.parametrize("name", VELOCITIES)
+
+
+def trained(name: str, dtype: torch.dtype = torch.float64) -> Velocity:
+    velocity = VELOCITIES[name]().to(dtype)
+    with torch.no_grad():
+        for parameter in velocity.parameters():
+            parameter += 0.2 * torch.randn_like(parameter)
+    return velocity
+
+
+def points(count: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    low, high = torch.tensor(BOX, dtype=dtype)
+    return torch.lerp(low, high, torch.rand(count, 3, dtype=dtype)), torch.rand(count, dtype=dtype)
+
+
+def jacobians(velocity: Callable[[Tensor, Tensor], Tensor], positions: Tensor, times: Tensor) -> Tensor:
+    positions = positions.clone().requires_grad_()
+    value = velocity(positions, times)
+    return torch.stack(
+        [torch.autograd.grad(value[:, i].sum(), positions, retain_graph=True)[0] for i in range(3)], dim=-2
+    )
+
+
+@every_velocity
+def test_nothing_moves_at_initialisation(name: str) -> None:
+    assert torch.count_nonzero(VELOCITIES[name]()(*points(50, torch.float32))) == 0
+
+
+@every_velocity
+def test_nothing_moves_on_the_faces_and_outside(name: str) -> None:
+    positions, times = points(60)
+    low, high = torch.tensor(BOX, dtype=torch.float64)
+    velocity = trained(name)
+    assert torch.count_nonzero(velocity(positions, times).abs().sum(-1)) > 30
+    for axis in range(3):
+        for face in (low[axis], high[axis], low[axis] - 1, high[axis] + 100):
+            moved = positions.clone()
+            moved[:, axis] = face
+            assert torch.count_nonzero(velocity(moved, times)) == 0
+
+
+@every_velocity
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,)])
+def test_shape_and_dtype_are_those_of_positions(name: str, batch: tuple[int, ...]) -> None:
+    for dtype in (torch.float32, torch.float64):
+        velocity = trained(name, dtype)
+        value = velocity(torch.zeros(*batch, 3, dtype=dtype), torch.zeros(batch, dtype=dtype))
+        assert value.shape == (*batch, 3)
+        assert value.dtype == dtype
+
+
+@every_velocity
+def test_fixed_times_give_the_same_field(name: str) -> None:
+    velocity = trained(name)
+    positions, times = points(20)
+    field = velocity.at(times)
+    assert torch.equal(field(positions), velocity(positions, times))
+    assert torch.equal(field(0.5 * positions), velocity(0.5 * positions, times))
+
+
+@every_velocity
+def test_times_beyond_the_film_are_finite(name: str) -> None:
+    velocity = trained(name)
+    positions, times = points(20)
+    assert torch.isfinite(velocity(positions, times + 1)).all()
+    assert torch.isfinite(velocity(positions, times - 1)).all()
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_gradcheck(name: str) -> None:
+    velocity = trained(name)
+    positions, times = points(3)
+    assert torch.autograd.gradcheck(velocity, (positions.requires_grad_(), times.requires_grad_()))
+
+
+def test_curl_has_no_divergence_even_where_it_fades() -> None:
+    velocity = trained("curl")
+    positions, times = points(400)
+    jacobian = jacobians(velocity, positions, times)
+    divergence = jacobian.diagonal(dim1=-2, dim2=-1).sum(-1)
+    # Sums of a few hundred terms of the Jacobian's size, in float64.
+    assert divergence.abs().max() < 1e-12 * jacobian.abs().max()
+    assert jacobian.abs().max() > 1
+    # Other fields have some: the test sees what it looks for.
+    other = jacobians(trained("network"), positions, times)
+    assert other.diagonal(dim1=-2, dim2=-1).sum(-1).abs().max() > 1e-3 * other.abs().max()
+
+
+def test_curl_is_the_curl_of_its_potential() -> None:
+    velocity = trained("curl")
+    assert isinstance(velocity, CurlVelocity)
+    positions, times = points(50)
+
+    def potential(x: Tensor, t: Tensor) -> Tensor:
+        amplitudes = velocity.amplitudes(velocity.encode_times(t[..., None])).unflatten(-1, (-1, 3))
+        waves = torch.sin(x @ velocity.wavevectors.T + velocity.phases)
+        return velocity.window(x) * (waves[..., None] * amplitudes).sum(-2)
+
+    jacobian = jacobians(potential, positions, times)
+    curl = torch.stack(
+        [
+            jacobian[:, 2, 1] - jacobian[:, 1, 2],
+            jacobian[:, 0, 2] - jacobian[:, 2, 0],
+            jacobian[:, 1, 0] - jacobian[:, 0, 1],
+        ],
+        dim=-1,
+    )
+    torch.testing.assert_close(velocity(positions, times), curl, rtol=0, atol=1e-11)
+
+
+def test_one_rigid_cluster_keeps_distances() -> None:
+    """The strain rate of one twist is zero well inside the box."""
+    velocity = RigidVelocity(BOX, 1, 16).double()
+    with torch.no_grad():
+        for parameter in velocity.parameters():
+            parameter += 0.3 * torch.randn_like(parameter)
+    positions, times = points(50)
+    jacobian = jacobians(velocity, 0.5 * (positions - velocity.window.center) + velocity.window.center, times)
+    assert jacobian.abs().max() > 0.1
+    torch.testing.assert_close(jacobian + jacobian.mT, torch.zeros_like(jacobian), rtol=0, atol=1e-12)
+
+
+def test_rigid_clusters_move_their_own_neighbourhoods() -> None:
+    velocity = RigidVelocity(BOX, 2, 16, radius=0.1).double()
+    with torch.no_grad():
+        velocity.centers.copy_(torch.tensor([[-0.5, 0.0, -0.5], [0.5, 0.0, -0.5]]))
+        twists = torch.zeros(2, 9)
+        twists[0, 2], twists[1, 3] = 2.0, -1.0  # the first turns about z, the second travels along x
+        velocity.motions.output.bias.copy_(twists.flatten())
+    near = torch.tensor([[-0.5, 0.1, -0.5], [0.5, 0.1, -0.5]], dtype=torch.float64)
+    expected = torch.tensor([[-0.2, 0.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
+    # Shares of the other cluster at ten radii are below 1e-20.
+    torch.testing.assert_close(velocity(near, torch.rand(2).double()), expected, rtol=0, atol=1e-12)
+
+
+def test_grid_velocity_is_linear_between_its_values() -> None:
+    velocity = GridVelocity(BOX, 4, 3).double()
+    torch.nn.init.normal_(velocity.values)
+    lattice = velocity.lattice
+    indices = torch.arange(lattice.num_knots * lattice.num_vertices)
+    positions, times = lattice.place(indices)
+    inside = velocity.window(positions.double())[:, 0] > 0
+    read = velocity(positions.double(), times.double())
+    expected = velocity.window(positions.double()) * velocity.values.reshape(-1, 4)[:, :3]
+    # Vertices are placed in float32.
+    torch.testing.assert_close(read[inside], expected[inside], rtol=0, atol=1e-5)
+    assert inside.sum() == 9  # cells of one unit: one column of three vertices at each of three knots
+
+
+@pytest.mark.parametrize("smoothness", range(5))
+def test_window_is_a_smooth_step_of_its_order(smoothness: int) -> None:
+    window = BoxWindow(BOX, 0.25, smoothness).double()
+    margin = 0.25
+    line = torch.linspace(1 - margin - 0.01, 1.01, 300, dtype=torch.float64, requires_grad=True)
+    centre = window.center.double()
+    positions = torch.stack([line, centre[1].expand_as(line), centre[2].expand_as(line)], dim=-1)
+    value = window(positions)[:, 0]
+    assert torch.all(value.diff() <= 0)
+    assert value[0] == 1
+    assert value[-1] == 0
+    # The Beta integral that the polynomial is, from its definition.
+    u = ((1 - line.detach()) / margin).clamp(0, 1)
+    n = smoothness
+    grid = torch.linspace(0, 1, 20001, dtype=torch.float64)
+    density = (grid * (1 - grid)) ** n
+    integral = torch.cumulative_trapezoid(density, grid)
+    exact = torch.cat([torch.zeros(1), integral]) / integral[-1]
+    found = exact[(u * 20000).round().long()]
+    torch.testing.assert_close(value.detach(), found, rtol=0, atol=1e-3)
+    derivative = value
+    for _ in range(smoothness):
+        (derivative,) = torch.autograd.grad(derivative.sum(), line, create_graph=True)
+        # Zero at both ends of the fading layer: no jump to what is constant beyond.
+        assert derivative[line > 1].abs().max() == 0
+        edge = derivative[(line - (1 - margin)).abs().argmin()].abs()
+        assert edge <= 0.2 * derivative.abs().max()
+
+
+def test_window_gradient_is_that_of_its_value() -> None:
+    window = BoxWindow(BOX, 0.7, 3).double()
+    positions = 1.3 * points(200)[0]
+    positions.requires_grad_()
+    value, gradient = window.value_and_gradient(positions)
+    assert torch.equal(value, window(positions))
+    (expected,) = torch.autograd.grad(value.sum(), positions)
+    torch.testing.assert_close(gradient, expected, rtol=0, atol=1e-12)
+
+
+def test_smooth_step_coefficients_are_the_known_ones() -> None:
+    assert smooth_step_coefficients(0) == [1]
+    assert smooth_step_coefficients(1) == [3, -2]
+    assert smooth_step_coefficients(2) == [10, -15, 6]
+    assert smooth_step_coefficients(4) == [126, -420, 540, -315, 70]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: BoxWindow(BOX, 0.0), "margin must be > 0"),
+        (lambda: BoxWindow(BOX, 1.5), r"margin must be in \(0, 1\]"),
+        (lambda: BoxWindow(BOX, 0.5, 5), r"smoothness in 0\.\.4"),
+        (lambda: GridVelocity(BOX, 4, 1), "num_knots must be at least 2"),
+        (lambda: CurlVelocity(BOX, 0), "num_waves must be > 0"),
+        (lambda: RigidVelocity(BOX, 0), "num_clusters must be > 0"),
+        (lambda: RigidVelocity(BOX, radius=math.inf), "radius must be > 0 and finite"),
+        (lambda: NetworkVelocity(BOX, 0), "num_layers must be > 0"),
+        (lambda: NetworkVelocity(BOX, activation="sine"), "activation must be one of relu, silu, softplus"),
+    ],
+)
+def test_bad_settings_are_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()

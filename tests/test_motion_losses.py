@@ -1,0 +1,139 @@
+"""Losses about motion against the closed forms of simple flows."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.benchmarks.closed_flows import Expansion, Rotation, Shear
+from dnerf.compositing import FieldOutput, Rendering
+from dnerf.deformations import DisplacementDeformation, FlowDeformation, LatticeFlow
+from dnerf.deformations.velocities import NetworkVelocity, Velocity
+from dnerf.fields import DeformedField
+from dnerf.motion_losses import AccelerationLoss, CycleConsistencyLoss, DivergenceLoss, SmoothVelocityLoss
+from dnerf.renderer import Renderer
+from dnerf.samplers import StratifiedSampler
+from dnerf.scenes import make_scene
+
+LOSSES = {
+    "smooth": SmoothVelocityLoss,
+    "divergence": DivergenceLoss,
+    "acceleration": AccelerationLoss,
+    "cycle": CycleConsistencyLoss,
+}
+every_loss = pytest.mark.parametrize("name", LOSSES)
+
+
+def renderer_of(velocity: Velocity, **settings: object) -> Renderer:
+    settings = {"canonical_time": 0.0, "num_steps": 16, **settings}
+    return Renderer(DeformedField(FlowDeformation(velocity, **settings), make_scene("static")), StratifiedSampler(4))
+
+
+def rendering(count: int = 64, dtype: torch.dtype = torch.float64) -> Rendering:
+    positions, times = torch.rand(count, 3, dtype=dtype) - 0.5, torch.rand(count, dtype=dtype)
+    extras = {"positions": positions, "times": times, "canonical_positions": positions}
+    output = FieldOutput(torch.ones(count), torch.ones(count, 3), extras)
+    return Rendering(torch.zeros(8, 3), torch.zeros(8), torch.zeros(8), weights=torch.rand(count), output=output)
+
+
+def value(loss: torch.nn.Module, velocity: Velocity, **settings: object) -> float:
+    return float(loss(rendering(), torch.zeros(8, 3), renderer_of(velocity, **settings)).detach())
+
+
+def test_smoothness_of_linear_fields_is_the_norm_of_their_matrix() -> None:
+    assert value(SmoothVelocityLoss(1.0), Rotation(2.0)) == pytest.approx(2 * 2.0**2, rel=1e-5)
+    assert value(SmoothVelocityLoss(0.5), Expansion(1.5)) == pytest.approx(0.5 * 3 * 1.5**2, rel=1e-5)
+
+
+def test_divergence_of_linear_fields_is_their_trace() -> None:
+    assert value(DivergenceLoss(1.0), Expansion(1.5)) == pytest.approx((3 * 1.5) ** 2, rel=1e-5)
+    assert value(DivergenceLoss(1.0), Rotation(2.0)) < 1e-9
+
+
+def test_acceleration_of_a_rotation_is_centripetal() -> None:
+    picture = rendering()
+    loss = AccelerationLoss(1.0, interval=0.02)(picture, torch.zeros(8, 3), renderer_of(Rotation(2.0), num_steps=64))
+    shares = picture.weights / picture.weights.sum()
+    radii = picture.output.extras["positions"][:, :2].norm(dim=-1)
+    expected = float((shares * (2.0**2 * radii) ** 2).sum())
+    # Central differences over 0.04 of a time in which it turns by 0.08: an error of (0.08)^2 / 12.
+    assert float(loss) == pytest.approx(expected, rel=2e-3)
+
+
+def test_acceleration_of_uniform_motion_is_zero() -> None:
+    class Uniform(Velocity):
+        def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+            return torch.ones_like(positions)
+
+    assert value(AccelerationLoss(1.0), Uniform()) < 1e-12
+    assert value(AccelerationLoss(1.0), Shear(2.0, 5.0)) > 1
+
+
+def test_cycle_is_the_squared_miss_of_the_uncorrected_inverse() -> None:
+    """One Euler step of an expansion: x (1 - k t) there, times (1 + k t) back."""
+    picture = rendering()
+    rate = 0.5
+    settings = {"solver": "euler", "num_steps": 1}
+    loss = CycleConsistencyLoss(1.0)(picture, torch.zeros(8, 3), renderer_of(Expansion(rate), **settings))
+    extras, shares = picture.output.extras, picture.weights / picture.weights.sum()
+    miss = (rate * extras["times"]) ** 2 * extras["positions"].norm(dim=-1)
+    assert float(loss) == pytest.approx(float((shares * miss.square()).sum()), rel=1e-6)
+    assert value(CycleConsistencyLoss(1.0), Expansion(rate), num_steps=64) < 1e-12
+
+
+@every_loss
+def test_gradients_reach_the_velocity(name: str) -> None:
+    velocity = NetworkVelocity(((-1.0,) * 3, (1.0,) * 3), 2, 16)
+    torch.nn.init.normal_(velocity.mlp.output.weight)
+    renderer = renderer_of(velocity, solver="midpoint", num_steps=2)
+    LOSSES[name](1.0)(rendering(dtype=torch.float32), torch.zeros(8, 3), renderer).backward()
+    for parameter in velocity.parameters():
+        assert torch.isfinite(parameter.grad).all()
+    assert torch.count_nonzero(velocity.from_positions.weight.grad) > 0
+
+
+@every_loss
+def test_a_flow_on_a_lattice_is_judged_by_its_flow(name: str) -> None:
+    renderer = renderer_of(Expansion(0.5), solver="euler", num_steps=4)
+    plain = LOSSES[name](1.0)
+    torch.manual_seed(5)
+    expected = plain(rendering(), torch.zeros(8, 3), renderer)
+    flow = renderer.field.deformation
+    renderer.field.deformation = LatticeFlow(flow, ((-1.0,) * 3, (1.0,) * 3), 4, 3)
+    torch.manual_seed(5)
+    assert plain(rendering(), torch.zeros(8, 3), renderer) == expected
+
+
+@every_loss
+def test_points_are_spread_over_the_batch_and_bounded(name: str) -> None:
+    points = LOSSES[name](1.0, 10)._points(rendering(64))
+    assert len(points.times) == 10
+    assert points.shares.sum().item() == pytest.approx(1)
+
+
+@every_loss
+def test_an_empty_picture_costs_nothing(name: str) -> None:
+    picture = rendering()
+    picture.weights.zero_()
+    loss = LOSSES[name](1.0)(picture, torch.zeros(8, 3), renderer_of(Rotation()))
+    assert loss == 0
+
+
+@every_loss
+def test_a_deformation_that_is_no_flow_is_named(name: str) -> None:
+    field = DeformedField(DisplacementDeformation(1, 4, ()), make_scene("static"))
+    with pytest.raises(ValueError, match="needs a renderer whose deformation is a flow, got DisplacementDeformation"):
+        LOSSES[name](1.0)(rendering(), torch.zeros(8, 3), Renderer(field, StratifiedSampler(4)))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: SmoothVelocityLoss(-1.0), "weight must be >= 0"),
+        (lambda: DivergenceLoss(1.0, 0), "num_points must be > 0"),
+        (lambda: AccelerationLoss(interval=0.6), r"interval must be in \(0, 0\.5\]"),
+        (lambda: SmoothVelocityLoss(distance=0.0), "distance must be > 0"),
+    ],
+)
+def test_bad_settings_are_refused(make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
