@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dnerf.checks import check_choice, check_positive, check_shape
+from dnerf.geometry import check_last_axis
 from dnerf.rays import Rays
 
 PIXEL_OFFSETS = {"center": 0.5, "corner": 0.0}
@@ -133,6 +134,26 @@ class Camera:
         check_shape("pose", self.pose, (4, 4))
         if not 0 <= self.near < self.far < math.inf:
             raise ValueError(f"near and far must be finite with 0 <= near < far, got {self.near} and {self.far}")
+
+    def project(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Where world positions (..., 3) are seen.
+
+        Returns:
+            pixels: (..., 2) column and row; whole numbers are where the rays of pixels go. Not finite in the plane of
+                the camera, mirrored behind it.
+            depth: (...,) z-depth in world units, negative behind the camera.
+        """
+        check_last_axis("positions", positions, 3)
+        camera, pose = self.intrinsics, self.pose.to(positions.dtype)
+        # Rows times the transposed rotation, without a matrix product, which GPUs may run in tf32.
+        local = ((positions - pose[:3, 3])[..., :, None] * pose[:3, :3]).sum(-2)
+        depth = -local[..., 2]
+        offset = PIXEL_OFFSETS[camera.pixel_origin]
+        center_x = 0.5 * camera.width if camera.center_x is None else camera.center_x
+        center_y = 0.5 * camera.height if camera.center_y is None else camera.center_y
+        columns = local[..., 0] / depth * camera.focal_x + (center_x - offset)
+        rows = center_y - offset - local[..., 1] / depth * camera.focal_y
+        return torch.stack([columns, rows], dim=-1), depth
 
     def rays(self, time: float) -> Rays:
         """Rays of all pixels in row order, (height * width) of them, at one time in [0, 1]."""

@@ -1,15 +1,21 @@
 """The multi-layer perceptron that fields and deformations share."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import check_positive
+from dnerf.checks import check_choice, check_positive
+
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "relu": torch.relu,
+    "silu": nn.functional.silu,
+    "softplus": nn.functional.softplus,
+}
 
 
 class MLP(nn.Module):
-    """Linear layers with ReLU between them; the input may be fed in again at hidden layers ("skips").
+    """Linear layers with an activation between them; the input may be fed in again at hidden layers ("skips").
 
     Args:
         in_features: size of the input.
@@ -19,9 +25,10 @@ class MLP(nn.Module):
         skips: hidden layers, counted from 0, whose input is the previous activation and the network's input
             (NeRF and D-NeRF: (5,) of eight).
         zero_output: start the last linear map at zero, so that the network is zero at initialisation.
+        activation: "relu", or "silu" or "softplus" for a smooth network.
 
     Raises:
-        ValueError: if sizes are not positive or a skip names no hidden layer but the first.
+        ValueError: for an unknown activation, or if sizes are not positive or a skip names no hidden layer but the first.
     """
 
     def __init__(
@@ -33,8 +40,11 @@ class MLP(nn.Module):
         out_features: int | None = None,
         skips: Sequence[int] = (),
         zero_output: bool = False,
+        activation: str = "relu",
     ) -> None:
         super().__init__()
+        check_choice("activation", activation, tuple(ACTIVATIONS))
+        self.activation = ACTIVATIONS[activation]
         check_positive("in_features", in_features)
         check_positive("hidden_features", hidden_features)
         check_positive("num_layers", num_layers, allow_zero=True)
@@ -61,5 +71,5 @@ class MLP(nn.Module):
         """Map (..., in_features) -> (..., out_features)."""
         x = inputs
         for i, layer in enumerate(self.hidden):
-            x = torch.relu(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
+            x = self.activation(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
         return x if self.output is None else self.output(x)

@@ -30,6 +30,7 @@ FLOORS = {
     "data": 6,
     "losses": 6,
     "metrics": 6,
+    "motion": 6,
     # 7: whole runs.
     "checkpoints": 7,
     "distributed": 7,

@@ -1,0 +1,180 @@
+"""Neural-ODE flow: a velocity field carries points between any time and the canonical one (Chen et al. 2018)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.checks import check_choice, check_positive
+from dnerf.deformations.base import InvertibleDeformation, check_positions_times
+from dnerf.deformations.solvers import RightHandSide, Solver, failure
+from dnerf.deformations.velocities.base import Velocity
+
+CLOCKS = ("running", "frozen")
+
+
+@dataclass
+class EvaluationCounts:
+    """How often velocity fields were evaluated (each evaluation is of a whole batch).
+
+    Args:
+        last: in the latest solve, forward or inverse; the adjoint's backward solve adds to it.
+        total: since the count was made.
+        solves: number of solves in `total`.
+    """
+
+    last: int = 0
+    total: int = 0
+    solves: int = 0
+
+
+class FlowDeformation(InvertibleDeformation):
+    """The flow of a velocity field: one differential equation for samples that each have their own time.
+
+    - `clock="running"`: matter moves with v, so x(t0) solves `dx/dtau = v(x, tau)` from tau = t to t0, written as
+      `dx/ds = (t0 - t) v(x, t + s (t0 - t))`, s in [0, 1]. v is the physical velocity; it can be extrapolated in time.
+    - `clock="frozen"`: `dx/ds = (t0 - t) v(x, t)`, the exponential of the field of the sample's own time (log-domain
+      diffeomorphisms: Arsigny et al. 2006, Ashburner 2007). As invertible, and the same where v does not depend on
+      time, but errors do not add up over long times and few steps suffice: with one Euler step it is D-NeRF's
+      displacement. v is not the physical velocity. With `canonical_time=None` the factor (t0 - t) is left out:
+      no time is canonical.
+
+    Both are the identity at initialisation if v is zero, both compose: motion from t to t' is
+    `inverse(forward(x, t), t')`.
+
+    Args:
+        velocity: the field, zero outside the scene's box.
+        canonical_time: t0, or None (frozen clock only).
+        clock: "running" or "frozen".
+        solver: name, see `Solver`.
+        num_steps: of a fixed-step solver.
+        rtol: of an adaptive solver.
+        atol: of an adaptive solver, in world units.
+        gradient: "direct" or "adjoint", see `Solver`.
+        max_steps: of an adaptive solver.
+        corrections: rounds that make `inverse` the inverse of the *discretised* `forward`: the equation solved
+            backwards misses it by both solves' errors; each round shrinks what is left by about that error.
+
+    Raises:
+        ValueError: for settings out of range, or a running clock without a canonical time.
+    """
+
+    def __init__(
+        self,
+        velocity: Velocity,
+        canonical_time: float | None = 0.0,
+        *,
+        clock: str = "running",
+        solver: str = "rk4",
+        num_steps: int = 8,
+        rtol: float = 1e-5,
+        atol: float = 1e-6,
+        gradient: str = "direct",
+        max_steps: int = 1000,
+        corrections: int = 2,
+    ) -> None:
+        super().__init__()
+        check_choice("clock", clock, CLOCKS)
+        check_positive("corrections", corrections, allow_zero=True)
+        if canonical_time is None and clock == "running":
+            raise ValueError("canonical_time must be a time in [0, 1] for a running clock, got None")
+        if canonical_time is not None and not 0 <= canonical_time <= 1:
+            raise ValueError(f"canonical_time must be in [0, 1] or None, got {canonical_time}")
+        self.velocity = velocity
+        self.canonical_time = canonical_time
+        self.clock = clock
+        self.solver = Solver(solver, num_steps, rtol=rtol, atol=atol, gradient=gradient, max_steps=max_steps)
+        self.corrections = corrections
+        self.evaluations = EvaluationCounts()
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Canonical positions (..., 3) of world positions (..., 3) at times (...,).
+
+        Raises:
+            ValueError: if times do not fit positions.
+            IntegrationError: where the solver fails or positions become infinite.
+        """
+        check_positions_times(positions, times)
+        return self._solve(positions, times, backwards=False)
+
+    def inverse(self, canonical: Tensor, times: Tensor) -> Tensor:
+        """World positions (..., 3) at times (...,) of canonical positions (..., 3); raises as `forward`."""
+        check_positions_times(canonical, times)
+        world, target = self.reverse(canonical, times), canonical
+        for _ in range(self.corrections):
+            target = target - (self.forward(world, times) - canonical)
+            world = self.reverse(target, times)
+        return world
+
+    def reverse(self, canonical: Tensor, times: Tensor) -> Tensor:
+        """The equation solved backwards in the same steps: `inverse` without corrections."""
+        check_positions_times(canonical, times)
+        return self._solve(canonical, times, backwards=True)
+
+    def _solve(self, positions: Tensor, times: Tensor, *, backwards: bool) -> Tensor:
+        if not positions.numel():
+            return positions
+        start, end, spans = self._spans(times, backwards)
+        self.evaluations.last = 0
+        self.evaluations.solves += 1
+        right_hand_side = self._right_hand_side(start, spans)
+        problem = None
+        try:
+            if self.solver.gradient == "adjoint":
+                equation = _AdjointEquation(self)
+                result = self.solver.solve_adjoint(equation, (positions, start, spans))[0]
+            else:
+                result = self.solver.solve(right_hand_side, positions)
+        except AssertionError as error:
+            problem = str(error)
+        else:
+            if not bool(torch.isfinite(result).all()):
+                problem = "positions are not finite"
+        if problem is not None:
+            raise failure(self.solver, problem, right_hand_side, positions, start, end) from None
+        return result
+
+    def _spans(self, times: Tensor, backwards: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Time at s = 0 and at s = 1, and the signed length of the way, (...,) each."""
+        if self.canonical_time is None:
+            length = torch.full_like(times, -1.0 if backwards else 1.0)
+            return times, times, length
+        canonical = torch.full_like(times, self.canonical_time)
+        start, end = (canonical, times) if backwards else (times, canonical)
+        return (times, times, end - start) if self.clock == "frozen" else (start, end, end - start)
+
+    def _right_hand_side(self, start: Tensor, spans: Tensor) -> RightHandSide:
+        column = spans[..., None]
+        if self.clock == "frozen":
+            field = self.velocity.at(start)
+
+            def frozen(s: float | Tensor, positions: Tensor) -> Tensor:
+                self._count()
+                return column * field(positions)
+
+            return frozen
+
+        def running(s: float | Tensor, positions: Tensor) -> Tensor:
+            self._count()
+            return column * self.velocity(positions, start + s * spans)
+
+        return running
+
+    def _count(self) -> None:
+        self.evaluations.last += 1
+        self.evaluations.total += 1
+
+
+class _AdjointEquation(nn.Module):
+    """The flow's equation for (positions, start, spans), so that the adjoint reaches times as well."""
+
+    def __init__(self, flow: FlowDeformation) -> None:
+        super().__init__()
+        self.velocity = flow.velocity
+        self._make: Callable[[Tensor, Tensor], RightHandSide] = flow._right_hand_side
+
+    def forward(self, s: Tensor, state: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        positions, start, spans = state
+        derivative = self._make(start, spans)(s, positions)
+        return derivative, torch.zeros_like(start), torch.zeros_like(spans)

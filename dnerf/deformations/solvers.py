@@ -1,0 +1,182 @@
+"""Integration of many points at once, each over its own span of time, as one ordinary differential equation.
+
+With `start` and `end` per point, `dx/ds = (end - start) v(x, start + s (end - start))` runs over s in [0, 1] for all.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchdiffeq import odeint, odeint_adjoint
+
+from dnerf.checks import check_choice, check_positive
+
+FIXED_SOLVERS = {"euler": 1, "midpoint": 2, "rk4": 4}
+"""Evaluations per step, which is also the order of each."""
+
+ADAPTIVE_SOLVERS = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
+SOLVERS = (*FIXED_SOLVERS, *ADAPTIVE_SOLVERS)
+GRADIENTS = ("direct", "adjoint")
+
+RightHandSide = Callable[[float | Tensor, Tensor], Tensor]
+"""Derivative (..., 3) to s, of s (a number) and positions (..., 3)."""
+
+
+class IntegrationError(ValueError):
+    """A velocity field that the chosen solver cannot integrate; names the time and what to change."""
+
+
+class Solver:
+    """How a flow is integrated.
+
+    Args:
+        name: "euler", "midpoint" or "rk4" (3/8 rule) with `num_steps` equal steps of s, written out here and equal to
+            torchdiffeq's to rounding; "dopri5", "dopri8", "bosh3", "fehlberg2" or "adaptive_heun" through torchdiffeq.
+        num_steps: of a fixed-step solver.
+        rtol: relative tolerance of an adaptive one.
+        atol: absolute tolerance of an adaptive one, in world units. In float32, tolerances below 1e-6 only cost.
+        gradient: "direct" differentiates the solver's steps; "adjoint" solves the adjoint equation backwards, whose
+            memory does not grow with the number of steps (Chen et al. 2018, arXiv 1806.07366, algorithm 2).
+        max_steps: of an adaptive solver, accepted and refused ones together, before it gives up.
+
+    Raises:
+        ValueError: for an unknown name or gradient, or numbers that are not positive.
+
+    The step size of an adaptive solver is shared by all points. It is controlled by the worst point's error, not by
+    torchdiffeq's mean over the batch, which would hide one hard point among ten thousand.
+    """
+
+    def __init__(
+        self,
+        name: str = "rk4",
+        num_steps: int = 8,
+        *,
+        rtol: float = 1e-5,
+        atol: float = 1e-6,
+        gradient: str = "direct",
+        max_steps: int = 1000,
+    ) -> None:
+        check_choice("solver", name, SOLVERS)
+        check_choice("gradient", gradient, GRADIENTS)
+        for argument, value in (("num_steps", num_steps), ("rtol", rtol), ("atol", atol), ("max_steps", max_steps)):
+            check_positive(argument, value)
+        self.name = name
+        self.num_steps = num_steps
+        self.rtol = rtol
+        self.atol = atol
+        self.gradient = gradient
+        self.max_steps = max_steps
+
+    @property
+    def is_adaptive(self) -> bool:
+        """Whether the number of steps follows the tolerances."""
+        return self.name in ADAPTIVE_SOLVERS
+
+    def solve(self, right_hand_side: RightHandSide, positions: Tensor) -> Tensor:
+        """Positions (..., 3) at s = 1 of those at s = 0, by the direct gradient.
+
+        Raises:
+            AssertionError: by torchdiffeq, where an adaptive solver cannot go on.
+        """
+        if not self.is_adaptive:
+            return fixed_steps(self.name, right_hand_side, positions, self.num_steps)
+        return odeint(right_hand_side, positions, _unit_interval(positions), **self._settings(_worst_point))[-1]
+
+    def solve_adjoint(self, right_hand_side: nn.Module, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """The state at s = 1, with gradients from the adjoint equation to the state and the module's parameters.
+
+        Args:
+            right_hand_side: maps s and the state to the state's derivatives.
+            state: tensors of any shapes, the first (..., 3).
+        """
+        settings = self._settings(lambda parts: _worst_point(parts[0]))
+        solution = odeint_adjoint(right_hand_side, state, _unit_interval(state[0]), **settings)
+        return tuple(part[-1] for part in solution)
+
+    def _settings(self, norm: Callable[[Any], Tensor]) -> Mapping[str, Any]:
+        if not self.is_adaptive:
+            # A step size would leave a tiny last step where 1 / num_steps rounds down.
+            return {"method": self.name, "options": {"grid_constructor": self._equal_steps}}
+        options = {"norm": norm, "max_num_steps": self.max_steps}
+        return {"method": self.name, "rtol": self.rtol, "atol": self.atol, "options": options}
+
+    def _equal_steps(self, _: Any, positions: Any, interval: Tensor) -> Tensor:
+        ends = interval[0].item(), interval[-1].item()
+        return torch.linspace(*ends, self.num_steps + 1, dtype=interval.dtype, device=interval.device)
+
+    def advice(self) -> str:
+        """What to change when an integration fails."""
+        if self.is_adaptive:
+            return "raise rtol and atol, take a fixed-step solver (rk4), or keep the velocity small and smooth"
+        return "take more steps, lower the learning rate, or keep the velocity small and smooth"
+
+
+def fixed_steps(name: str, right_hand_side: RightHandSide, positions: Tensor, num_steps: int) -> Tensor:
+    """Positions at s = 1 by equal steps of an explicit Runge-Kutta rule of order 1, 2 or 4 (the 3/8 rule)."""
+    step = 1 / num_steps
+    for i in range(num_steps):
+        positions = positions + step * _increment(name, right_hand_side, positions, i * step, step)
+    return positions
+
+
+def _increment(name: str, f: RightHandSide, x: Tensor, s: float, h: float) -> Tensor:
+    """Mean derivative over one step from s to s + h."""
+    first = f(s, x)
+    if name == "euler":
+        return first
+    if name == "midpoint":
+        return f(s + h / 2, x + (h / 2) * first)
+    second = f(s + h / 3, x + (h / 3) * first)
+    third = f(s + 2 * h / 3, x + h * (second - first / 3))
+    fourth = f(s + h, x + h * (first - second + third))
+    return (first + 3 * (second + third) + fourth) / 8
+
+
+def _unit_interval(like: Tensor) -> Tensor:
+    return torch.tensor([0.0, 1.0], dtype=like.dtype, device=like.device)
+
+
+def _worst_point(values: Tensor) -> Tensor:
+    """Largest root mean square over the last axis."""
+    return values.square().mean(-1).amax().sqrt()
+
+
+def failure(
+    solver: Solver, reason: str, right_hand_side: RightHandSide, positions: Tensor, start: Tensor, end: Tensor
+) -> IntegrationError:
+    """The error to raise for a failed integration: found by small steps that stop where positions break or move most.
+
+    Args:
+        solver: that failed.
+        reason: what happened, in words.
+        right_hand_side: of the equation.
+        positions: (..., 3) at s = 0.
+        start: (...,) time at s = 0.
+        end: (...,) time at s = 1.
+    """
+    num_steps = 64 if solver.is_adaptive else solver.num_steps
+    flat_start, flat_end = start.reshape(-1), end.reshape(-1)
+    fastest, where, index = -1.0, 0.0, 0
+    with torch.no_grad():
+        x = positions.detach()
+        for i in range(num_steps):
+            s = i / num_steps
+            speed = right_hand_side(s, x).reshape(-1, 3).norm(dim=-1)
+            broken = ~torch.isfinite(speed)
+            worst = int(broken.to(torch.int8).argmax() if bool(broken.any()) else speed.argmax())
+            if bool(broken.any()) or float(speed[worst]) > fastest:
+                fastest, where, index = float(speed[worst]), s, worst
+            if bool(broken.any()):
+                break
+            x = x + _increment("euler" if solver.is_adaptive else solver.name, right_hand_side, x, s, 1 / num_steps) / (
+                num_steps
+            )
+    begin, finish = float(flat_start[index]), float(flat_end[index])
+    length = abs(finish - begin)
+    speed_text = "not finite" if not math.isfinite(fastest) else f"{fastest / length if length else 0:.3g} per unit time"
+    return IntegrationError(
+        f"flow: {reason} at time {begin + where * (finish - begin):.4g} (point {index} of {len(flat_start)}, from time "
+        f"{begin:.4g} to {finish:.4g}, speed {speed_text}) with {solver.name}; {solver.advice()}"
+    )

@@ -1,0 +1,80 @@
+"""Velocity as a small network of position and time."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.checks import check_positive
+from dnerf.deformations.velocities.base import BoxWindow, Velocity
+from dnerf.encodings import SinusoidalEncoding
+from dnerf.mlp import ACTIVATIONS, MLP
+
+
+class NetworkVelocity(Velocity):
+    """v(x, t) = w(x) MLP(x, t), w the window of the box; zero everywhere at initialisation.
+
+    The first layer is linear in the encodings of position and of time apart, so the part of time is worked out once
+    where a solver looks several times at the same times (`at`).
+
+    Args:
+        box: (2, 3) corners outside of which nothing moves, in world units.
+        num_layers: hidden layers, >= 1.
+        hidden_features: their width.
+        position_frequencies: octaves of the positions' encoding.
+        time_frequencies: octaves of the times' encoding.
+        activation: of the hidden layers; "silu" is smooth, so that solvers keep their order, "relu" is cheaper.
+        margin: see `BoxWindow`.
+        smoothness: see `BoxWindow`.
+        window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(
+        self,
+        box: Sequence[Sequence[float]],
+        num_layers: int = 3,
+        hidden_features: int = 64,
+        *,
+        position_frequencies: int = 3,
+        time_frequencies: int = 5,
+        activation: str = "silu",
+        margin: float = 0.1,
+        smoothness: int = 4,
+        window_end: float | None = None,
+    ) -> None:
+        super().__init__()
+        check_positive("num_layers", num_layers)
+        self.window = BoxWindow(box, margin, smoothness)
+        self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
+        self.encode_times = SinusoidalEncoding(1, time_frequencies)
+        self.from_positions = nn.Linear(self.encode_positions.out_features, hidden_features, bias=False)
+        self.from_times = nn.Linear(self.encode_times.out_features, hidden_features)
+        nn.init.kaiming_uniform_(self.from_positions.weight, nonlinearity="relu")
+        nn.init.kaiming_uniform_(self.from_times.weight, nonlinearity="relu")
+        nn.init.zeros_(self.from_times.bias)
+        self.mlp = MLP(
+            hidden_features,
+            hidden_features,
+            num_layers - 1,
+            out_features=3,
+            zero_output=True,
+            activation=activation,
+        )
+        self.activation = ACTIVATIONS[activation]
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Velocity (..., 3) at positions (..., 3) and times (...,)."""
+        return self.at(times)(positions)
+
+    def at(self, times: Tensor) -> Callable[[Tensor], Tensor]:
+        """The field at fixed times, their part of the first layer worked out once."""
+        of_times = self.from_times(self.encode_times(times[..., None]))
+
+        def velocity(positions: Tensor) -> Tensor:
+            hidden = self.activation(self.from_positions(self.encode_positions(positions)) + of_times)
+            return self.window(positions) * self.mlp(hidden).to(positions.dtype)
+
+        return velocity
