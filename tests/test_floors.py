@@ -31,12 +31,14 @@ FLOORS = {
     "losses": 6,
     "metrics": 6,
     "motion": 6,
+    "visualisation": 6,
     # 7: whole runs.
     "checkpoints": 7,
     "distributed": 7,
     "evaluation": 7,
     "logs": 7,
     "report": 7,
+    "sequences": 7,
     "training": 7,
     "video": 7,
     "viewer": 7,
@@ -54,6 +56,8 @@ WITHIN_A_FLOOR = {
     ("logs", "video"),
     ("mlp", "checks"),
     ("rays", "checks"),
+    ("sequences", "logs"),
+    ("sequences", "video"),
 }
 
 ONLY_SCRIPTS_KNOW = {"hydra", "omegaconf"}

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dnerf.checks import check_choice
 from dnerf.scenes.base import AnalyticScene
 from dnerf.scenes.bodies import Body
+from dnerf.scenes.exact_motion import ExactFlow, ExactTracks, exact_flow, exact_tracks, first_surfaces, is_visible
 from dnerf.scenes.glossy_ball import make_glossy_ball
 from dnerf.scenes.motions import Fixed, Joint, Motion, Orbit, Pulse, Slide, Spin, Wave
 from dnerf.scenes.orbiting_balls import make_orbiting_balls
@@ -55,6 +56,8 @@ __all__ = [
     "Box",
     "Capsule",
     "Checker",
+    "ExactFlow",
+    "ExactTracks",
     "Fixed",
     "Glossy",
     "Glow",
@@ -73,7 +76,11 @@ __all__ = [
     "Stripes",
     "Texture",
     "Wave",
+    "exact_flow",
+    "exact_tracks",
+    "first_surfaces",
     "grid_planes",
+    "is_visible",
     "make_glossy_ball",
     "make_orbiting_balls",
     "make_pulsing_fog",

@@ -53,7 +53,7 @@ def first_surfaces(scene: AnalyticScene, rays: Rays) -> SurfacePoints:
     return SurfacePoints(torch.where((owners >= 0)[:, None], positions, torch.nan), owners, distances)
 
 
-def carry(scene: AnalyticScene, points: SurfacePoints, t0: Tensor, t1: Tensor) -> Tensor:
+def carry_points(scene: AnalyticScene, points: SurfacePoints, t0: Tensor, t1: Tensor) -> Tensor:
     """Positions (R, 3) at times t1 (R,) of points of known bodies at times t0 (R,), exactly; NaN where there are none.
 
     Unlike `AnalyticScene.advect` it does not ask who holds the points, which rounding decides on a surface.
@@ -120,7 +120,7 @@ def exact_flow(
     rays = _precise_rays(first, t0, dtype)
     points = first_surfaces(scene, rays)
     later = torch.full_like(rays.times, t1)
-    moved = carry(scene, points, rays.times, later)
+    moved = carry_points(scene, points, rays.times, later)
     there, _ = second.project(moved)
     here = _pixel_grid(first, dtype)
     matter = points.owners >= 0
@@ -179,7 +179,7 @@ def exact_tracks(scene: AnalyticScene, cameras: Sequence[Camera], times: Sequenc
     start = torch.full_like(points.distances, times[0])
     places, projected, seen = [], [], []
     for camera, time in zip(cameras, times):
-        moved = carry(scene, points, start, torch.full_like(start, time))
+        moved = carry_points(scene, points, start, torch.full_like(start, time))
         places.append(moved)
         projected.append(camera.project(moved)[0])
         seen.append(is_visible(scene, camera, time, moved))

@@ -171,8 +171,14 @@ def _parse_key(where: str, entry: Any) -> dict[str, list[float]]:
 def _numbers(where: str, value: Any, count: int) -> list[float]:
     numbers: Sequence[Any] = value if isinstance(value, list) else [value]
     fits = isinstance(value, list) == (count > 1) and len(numbers) == count
-    # A JSON true is a Python int, and NaN is read as a float.
-    if not fits or any(isinstance(n, bool) or not isinstance(n, (int, float)) or not math.isfinite(n) for n in numbers):
+    if not fits or not all(_is_finite(number) for number in numbers):
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
         raise ValueError(f"{where} must be {expected}, got {value!r}")
     return [float(n) for n in numbers]
+
+
+def _is_finite(value: Any) -> bool:
+    # A JSON true is a Python int, NaN is read as a float, and an int may be too long for one.
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= 1e300 and math.isfinite(value)
