@@ -43,7 +43,7 @@ def warping_error(first: Tensor, second: Tensor, flow: Tensor, visible: Tensor) 
 
         E = 1 / |V| sum_{p in V} mean_c (second(p + flow(p)) - first(p))^2
 
-    Source: E_warp of Lai et al., "Learning blind video temporal consistency" (ECCV 2018), eq. 12-13, who sum over
+    Source: E_warp of Lai et al., "Learning blind video temporal consistency" (ECCV 2018), who sum over
     channels where this is their mean, and estimate flow and occlusion where they may be exact here. Bilinear
     interpolation blurs: the true pictures have an error too, the floor to compare with.
 
