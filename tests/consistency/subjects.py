@@ -22,7 +22,7 @@ from dnerf.training import Trainer
 BOX = ((-1.35, -1.35, -1.0), (1.35, 1.35, 1.0))
 NUM_SLABS = 8
 TRAIN_FRAMES = 40
-BATCH = 4096
+BATCH = 2048
 REACH = 0.5
 
 
@@ -43,7 +43,7 @@ def exact(name: str) -> Renderer:
     return Renderer(scene, ExactSampler(scene))
 
 
-def camera_rays(size: int = 20) -> Rays:
+def camera_rays(size: int = 14) -> Rays:
     """Rays of a small picture, in double precision so that tiny steps of time are what they say."""
     camera = Camera(Intrinsics.from_angle(size, size, 0.6), look_at((3.5, 0.6, 1.7)))
     return camera.rays(0.0)
@@ -59,7 +59,7 @@ PAIRS: dict[str, Pair] = {
 }
 
 
-def training_points(scene: AnalyticScene, count: int = 1 << 18) -> Tensor:
+def training_points(scene: AnalyticScene, count: int = 1 << 16) -> Tensor:
     """Random points at training times, as many in matter as near and far from it: position, time, hidden share, rgb."""
     generator = torch.Generator().manual_seed(0)
     low, high = torch.tensor(BOX)
@@ -74,7 +74,7 @@ def training_points(scene: AnalyticScene, count: int = 1 << 18) -> Tensor:
 
 
 @cache
-def fitted(pair: str, scene_name: str, num_steps: int = 150) -> Renderer:
+def fitted(pair: str, scene_name: str, num_steps: int = 80) -> Renderer:
     """A pair fitted to an exact scene: seeded regression on density and colour at random points and times.
 
     A second of it gives a pair that moves in earnest, though roughly: enough for the checks that ask how it moves rather
@@ -99,7 +99,7 @@ def fitted(pair: str, scene_name: str, num_steps: int = 150) -> Renderer:
         loss.backward()
         optimizer.step()
         schedule.step()
-    renderer = Renderer(field.requires_grad_(False), StratifiedSampler(64, BOX))
+    renderer = Renderer(field.requires_grad_(False), StratifiedSampler(48, BOX))
     return renderer.eval()
 
 
