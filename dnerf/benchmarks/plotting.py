@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from dnerf.benchmarks.suite import Plot, Series
+from dnerf.benchmarks.suite import BarPlot, Plot, Series
 from dnerf.checks import check_choice
 from dnerf.files import atomic_path
 
@@ -14,34 +14,54 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 STYLES = ("line", "points", "guide")
 
 
-def draw(plot: Plot, path: Path) -> None:
+def draw(plot: Plot | BarPlot, path: Path) -> None:
     """Write a plot as PNG.
 
     Raises:
         ValueError: without matplotlib, without a series, or for an unknown style.
     """
-    if not plot.series:
-        raise ValueError(f"series of plot {plot.name!r} must hold at least one, got none")
     pyplot = _pyplot()
     figure, axes = pyplot.subplots(figsize=(8.4, 5.0), dpi=120, layout="constrained")
     try:
-        ends = [_draw_series(axes, series, index) for index, series in enumerate(plot.series)]
         axes.set_title(plot.title, loc="left", fontsize=12, fontweight="bold")
         axes.set_xlabel(plot.x_label)
-        axes.set_ylabel(plot.y_label)
-        if plot.x_log:
-            axes.set_xscale("log")
-            _plain_ticks(axes.xaxis, *axes.get_xlim())
-        if plot.y_log:
-            axes.set_yscale("log")
-            _plain_ticks(axes.yaxis, *axes.get_ylim())
-        axes.grid(True, which="major", color="#DDDDDD", linewidth=0.8)
         axes.spines[["top", "right"]].set_visible(False)
-        _label_ends(figure, axes, [end for end in ends if end is not None])
+        if isinstance(plot, BarPlot):
+            _draw_bars(axes, plot)
+        else:
+            _draw_lines(figure, axes, plot)
         with atomic_path(path) as temporary:
             figure.savefig(temporary, format="png")
     finally:
         pyplot.close(figure)
+
+
+def _draw_lines(figure: Any, axes: Any, plot: Plot) -> None:
+    if not plot.series:
+        raise ValueError(f"series of plot {plot.name!r} must hold at least one, got none")
+    ends = [_draw_series(axes, series, index) for index, series in enumerate(plot.series)]
+    axes.set_ylabel(plot.y_label)
+    if plot.x_log:
+        axes.set_xscale("log")
+        _plain_ticks(axes.xaxis, *axes.get_xlim())
+    if plot.y_log:
+        axes.set_yscale("log")
+        _plain_ticks(axes.yaxis, *axes.get_ylim())
+    axes.grid(True, which="major", color="#DDDDDD", linewidth=0.8)
+    _label_ends(figure, axes, [end for end in ends if end is not None])
+
+
+def _draw_bars(axes: Any, plot: BarPlot) -> None:
+    count = len(plot.values)
+    height = 0.8 / count
+    for index, (label, lengths) in enumerate(plot.values.items()):
+        places = [k - 0.4 + (index + 0.5) * height for k in range(len(plot.categories))]
+        bars = axes.barh(places, lengths, 0.92 * height, color=COLORS[index % len(COLORS)], label=label)
+        texts = [f" {length:.3g}" if math.isfinite(length) else "" for length in lengths]
+        axes.bar_label(bars, texts, fontsize=8)
+    axes.set_yticks(range(len(plot.categories)), plot.categories)
+    axes.invert_yaxis()
+    axes.legend(frameon=False, loc="lower right", fontsize=10)
 
 
 def _pyplot() -> Any:

@@ -80,6 +80,27 @@ class Plot:
 
 
 @dataclass(frozen=True)
+class BarPlot:
+    """Horizontal bars, one group for each category.
+
+    Args:
+        name: of the file, without suffix.
+        title: what is shown.
+        x_label: of the bars' length, with unit.
+        categories: labels of the groups, from top to bottom.
+        values: lengths by label of the bars, one per category; NaN for none.
+        note: one sentence on how to read it.
+    """
+
+    name: str
+    title: str
+    x_label: str
+    categories: Sequence[str]
+    values: Mapping[str, Sequence[float]]
+    note: str = ""
+
+
+@dataclass(frozen=True)
 class SuiteResult:
     """What a suite found.
 
@@ -94,7 +115,7 @@ class SuiteResult:
     title: str
     summary: str
     tables: Sequence[Table]
-    plots: Sequence[Plot] = ()
+    plots: Sequence[Plot | BarPlot] = ()
     findings: Sequence[str] = ()
 
 
