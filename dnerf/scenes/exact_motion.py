@@ -44,9 +44,12 @@ def first_surfaces(scene: AnalyticScene, rays: Rays) -> SurfacePoints:
     distances = torch.full_like(rays.near, torch.inf)
     owners = torch.full(distances.shape, -1, device=distances.device)
     for index, (body, pose) in enumerate(zip(scene.bodies, _poses(scene, rays.times))):
-        enter, leave = body.intersect(pose, rays.origins, rays.directions)
-        enter, leave = torch.maximum(enter, rays.near), torch.minimum(leave, rays.far)
-        nearer = (leave > enter) & (enter < distances)
+        enter, leave = body.spans(pose, rays.origins, rays.directions, rays.near, rays.far)
+        enter, leave = torch.maximum(enter, rays.near[:, None]), torch.minimum(leave, rays.far[:, None])
+        # A body that is not there at the time has no density.
+        there = (leave > enter) & (body.density_at(pose) > 0)[:, None]
+        enter = torch.where(there, enter, torch.inf).amin(-1)
+        nearer = enter < distances
         distances = torch.where(nearer, enter, distances)
         owners = torch.where(nearer, index, owners)
     positions = rays.origins + distances[:, None] * rays.directions
