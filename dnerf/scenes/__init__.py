@@ -104,13 +104,10 @@ __all__ = [
     "exact_tracks",
     "first_surfaces",
     "grid_planes",
-<<<<<<< HEAD
     "is_visible",
-=======
     "make_bending_rod",
     "make_dense_fog",
     "make_fast_ball",
->>>>>>> f207e3c
     "make_glossy_ball",
     "make_jumping_ball",
     "make_merging_balls",
