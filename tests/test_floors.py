@@ -16,6 +16,7 @@ FLOORS = {
     "files": 0,
     "geometry": 0,
     "mlp": 0,
+    "provenance": 0,
     "rays": 0,
     # 1: one ray at a time.
     "backgrounds": 1,
@@ -31,14 +32,18 @@ FLOORS = {
     "losses": 6,
     "metrics": 6,
     "motion": 6,
+    "consistency": 7,
     "visualisation": 6,
     # 7: whole runs.
     "checkpoints": 7,
     "distributed": 7,
     "evaluation": 7,
     "logs": 7,
+    "plots": 6,
+    "protocols": 6,
     "report": 7,
     "sequences": 7,
+    "temporal_evaluation": 7,
     "training": 7,
     "video": 7,
     "viewer": 7,
@@ -60,6 +65,7 @@ WITHIN_A_FLOOR = {
     ("rays", "checks"),
     ("sequences", "logs"),
     ("sequences", "video"),
+    ("temporal_evaluation", "evaluation"),
 }
 
 ONLY_SCRIPTS_KNOW = {"hydra", "omegaconf"}
