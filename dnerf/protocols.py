@@ -33,9 +33,7 @@ class Protocol:
 
 
 PROTOCOLS = {
-    "dnerf": Protocol(
-        "dnerf", 400, "white", note="D-NeRF, TiNeuVox, K-Planes, HexPlane: half resolution on white"
-    ),
+    "dnerf": Protocol("dnerf", 400, "white", note="D-NeRF, TiNeuVox, K-Planes, HexPlane: half resolution on white"),
     "gs": Protocol("gs", 800, "black", note="Gaussian-splatting papers: full resolution on black"),
 }
 
@@ -78,8 +76,8 @@ MEAN_COLUMNS = ("psnr", "ssim", "lpips", "train_seconds", "seconds_per_frame")
 def scene_means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Means over scenes per method: over D-NeRF's eight, over the seven without Lego, or over what is there.
 
-    Runs of one scene that differ in the seed are averaged first. The eight- and seven-scene means are given only when all
-    their scenes are; "mean" covers the scenes present if they are neither.
+    Runs of one scene that differ in the seed are averaged first. The eight- and seven-scene means are given only when
+    all their scenes are; "mean" covers the scenes present if they are neither.
 
     Args:
         rows: scores, with the keys of `COLUMNS`.
@@ -113,7 +111,7 @@ def _means(by_scene: Mapping[str, Sequence[Mapping[str, Any]]], scenes: Sequence
     for column in MEAN_COLUMNS:
         values = [[row.get(column) for row in by_scene[scene]] for scene in scenes]
         if all(value is not None for of_scene in values for value in of_scene):
-            means[column] = fmean(fmean(of_scene) for of_scene in values)  # type: ignore[arg-type, type-var]
+            means[column] = fmean(fmean(of_scene) for of_scene in values)  # type: ignore[arg-type]
     return means
 
 

@@ -23,7 +23,7 @@ def hardware() -> str:
 
 @cache
 def commit() -> str:
-    """The commit that the package was run from, "-dirty" if its files differ from it; "unknown" outside a repository."""
+    """The commit that the package was run from, "-dirty" if files differ from it; "unknown" outside a repository."""
     root = Path(__file__).parent
     try:
         found = subprocess.run(

@@ -72,8 +72,7 @@ def write_report_text(
         protocol_note=_protocol_note(first),
         films=[_film(path) for path in films],
         sheets=[{"title": heading, "caption": caption, "uri": data_uri(path)} for heading, caption, path in sheets],
-        curves=[{"title": f"PSNR over time, {m['split']} split, {_protocol(m)}", "svg": frame_curves({m["split"]: m["frames"]})}
-                for m in metrics],
+        curves=[_curve(m) for m in metrics],
         temporal=None if temporal is None else _temporal(temporal),
         table=_table(metrics),
         facts=_facts(first),
@@ -123,6 +122,12 @@ def _film(path: Path) -> dict[str, str]:
     return {"uri": data_uri(path), "kind": kind, "caption": Path(path).stem.replace("_", " ")}
 
 
+def _curve(metrics: Mapping[str, Any]) -> dict[str, str]:
+    split = metrics["split"]
+    title = f"PSNR over time, {split} split, {_protocol(metrics)}"
+    return {"title": title, "svg": frame_curves({split: metrics["frames"]})}
+
+
 def _protocol(metrics: Mapping[str, Any]) -> str:
     name = metrics.get("protocol", "own")
     return "the run's own protocol" if name == "own" else f"protocol {name}"
@@ -152,7 +157,8 @@ def _protocol_note(metrics: Mapping[str, Any]) -> str:
     size = f"{metrics['resolution']} pixels wide, " if "resolution" in metrics else ""
     background = f"on {metrics['background']}, " if "background" in metrics else ""
     return (
-        f"Means over {metrics['num_frames']} frames of the {metrics['split']} split, {size}{background}{_protocol(metrics)}. "
+        f"Means over {metrics['num_frames']} frames of the {metrics['split']} split, "
+        f"{size}{background}{_protocol(metrics)}. "
         "PSNR is of floats clamped to [0, 1] against 8-bit truths; SSIM has a Gaussian window of 11 pixels."
     )
 
@@ -167,12 +173,11 @@ def _temporal(scores: Mapping[str, Any]) -> dict[str, Any]:
     rows = []
     for name, reference, meaning, form in TEMPORAL:
         if name in scores:
-            known = reference is not None and reference in scores
             rows.append(
                 {
                     "name": name.replace("_", " "),
                     "value": format(scores[name], form),
-                    "reference": format(scores[reference], form) if known else "",
+                    "reference": format(scores[reference], form) if reference and reference in scores else "",
                     "meaning": meaning,
                 }
             )
@@ -189,8 +194,10 @@ def _table(metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _facts(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     names = (
         ("seed", "seed", ""), ("num_steps", "training steps", ",d"), ("train_seconds", "training seconds", ".1f"),
-        ("num_parameters", "parameters", ",d"), ("train_hardware", "trained on", ""), ("train_commit", "trained at commit", ""),
-        ("hardware", "scored on", ""), ("commit", "scored at commit", ""), ("version", "dnerf", ""), ("torch", "torch", ""),
+        ("num_parameters", "parameters", ",d"), ("train_hardware", "trained on", ""),
+        ("train_commit", "trained at commit", ""),
+        ("hardware", "scored on", ""), ("commit", "scored at commit", ""), ("version", "dnerf", ""),
+        ("torch", "torch", ""),
     )  # fmt: skip
     return [(label, _cell(metrics[key], form)) for key, label, form in names if metrics.get(key) is not None]
 

@@ -1,5 +1,6 @@
 """Scoring a model over time: a short film at even steps, against exact motion where it is known."""
 
+import itertools
 import math
 from dataclasses import asdict, dataclass
 from statistics import fmean
@@ -118,7 +119,7 @@ def evaluate_over_time(
     if num_frames < 3:
         raise ValueError(f"num_frames must be at least 3, got {num_frames}")
     film = _shoot(renderer, camera, [i / (num_frames - 1) for i in range(num_frames)], chunk)
-    common = {"num_frames": num_frames, "time_step": film.times[1], "flicker": flicker(film.pictures)}
+    common: dict[str, Any] = {"num_frames": num_frames, "time_step": film.times[1], "flicker": flicker(film.pictures)}
     if scene is not None:
         return _against_exact(renderer, scene, film, common)
     errors, depths, shares = [], [], []
@@ -135,7 +136,7 @@ def evaluate_over_time(
 def _shoot(renderer: Renderer, camera: Camera, times: list[float], chunk: int) -> _Film:
     renderings = [renderer.render_image(camera, time, chunk=chunk) for time in times]
     model, motions = motion_model(renderer), []
-    for i, (first, second) in enumerate(zip(renderings, renderings[1:])):
+    for i, (first, second) in enumerate(itertools.pairwise(renderings)):
         # Rays that meet nothing have depth 0, but hide nothing.
         hiding = torch.where(second.opacity < 0.5, torch.inf, second.depth)
         vectors = motion_vectors(
@@ -145,9 +146,7 @@ def _shoot(renderer: Renderer, camera: Camera, times: list[float], chunk: int) -
     return _Film(camera, times, torch.stack([r.rgb.clamp(0, 1) for r in renderings]), renderings, motions)
 
 
-def _against_exact(
-    renderer: Renderer, scene: AnalyticScene, film: _Film, common: dict[str, Any]
-) -> TemporalScores:
+def _against_exact(renderer: Renderer, scene: AnalyticScene, film: _Film, common: dict[str, Any]) -> TemporalScores:
     camera, pictures = film.camera, film.pictures
     background = renderer.background(torch.zeros(1, 3, device=pictures.device))[0]
     truths = [render_exact(scene, camera.rays(time), background)[0] for time in film.times]
@@ -171,14 +170,13 @@ def _against_exact(
                 "found": float(seen.sum() / flow.visible.sum().clamp(min=1)),
             }
         )
+    means: dict[str, Any] = {name: _mean([row[name] for row in rows]) for name in rows[0]}
     return TemporalScores(
         motion="exact",
         true_flicker=flicker(truth),
         temporal_psnr=min(temporal_psnr(pictures, truth), MAX_PSNR),
         film_psnr=fmean(min(psnr(a, b), MAX_PSNR) for a, b in zip(pictures, truth)),
-        **_track_scores(renderer, camera, scene, film.times),
-        **{name: _mean([row[name] for row in rows]) for name in rows[0]},
-        **common,
+        **{**common, **_track_scores(renderer, camera, scene, film.times), **means},
     )
 
 
@@ -198,9 +196,7 @@ def _track_scores(renderer: Renderer, camera: Camera, scene: AnalyticScene, time
     size = max(camera.intrinsics.height, camera.intrinsics.width)
     in_space = track_errors(tracks, truth.positions.to(tracks))
     still = track_errors(start.expand_as(tracks), truth.positions.to(tracks))
-    in_picture = track_errors(
-        camera.project(tracks)[0], truth.pixels.to(tracks), truth.visible, picture_size=size
-    )
+    in_picture = track_errors(camera.project(tracks)[0], truth.pixels.to(tracks), truth.visible, picture_size=size)
     return {
         "track_error": in_space.mean,
         "still_track_error": still.mean,

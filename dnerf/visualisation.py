@@ -124,7 +124,7 @@ def flow_colors(flow: Tensor, max_length: float) -> Tensor:
     """Colour motion by direction (hue) and length (saturation), white at rest, grey where it is not known.
 
     The wheel of Baker et al., "A database and evaluation methodology for optical flow" (ICCV 2007), as in their
-    `colorcode.cpp`: right is red, down yellow, left cyan-blue, up violet; longer vectors than `max_length` are darkened.
+    `colorcode.cpp`: right is red, down yellow, left cyan-blue, up violet; vectors beyond `max_length` are darkened.
 
     Args:
         flow: (..., 2) pixels to the right and down; NaN where unknown.
@@ -153,7 +153,7 @@ def flow_colors(flow: Tensor, max_length: float) -> Tensor:
 
 
 def flow_picture(flow: Tensor, max_length: float, unit: str = "px") -> Tensor:
-    """`flow_colors` of a picture (H, W, 2) with the wheel and its longest length on the right, (H, W + key, 3) uint8."""
+    """`flow_colors` of a picture (H, W, 2) with the wheel and its length on the right, (H, W + key, 3) uint8."""
     check_shape("flow", flow, ("H", "W", 2))
     height = flow.shape[0]
     font = _font(height)

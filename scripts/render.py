@@ -179,9 +179,7 @@ def _times(config: DictConfig, count: int) -> list[float]:
     return (sweep_times if time == "sweep" else pingpong_times)(count, start, end)
 
 
-def _truth(
-    data: DataSource, frames: Frames, renderer: Renderer, *, same_size: bool
-) -> Callable[[View], Tensor] | None:
+def _truth(data: DataSource, frames: Frames, renderer: Renderer, *, same_size: bool) -> Callable[[View], Tensor] | None:
     """What gives the true picture of a view: the data's own picture, or the exact scene; None if neither does."""
     background = renderer.background(torch.zeros(1, 3, device=renderer.device))[0]
     if isinstance(data, SyntheticData):

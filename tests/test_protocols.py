@@ -23,7 +23,11 @@ PUBLISHED = dict(zip(DNERF_SCENES, (39.49, 25.58, 31.86, 32.73, 24.32, 35.55, 35
 
 
 def test_protocols_are_those_that_papers_use() -> None:
-    assert (PROTOCOLS["dnerf"].resolution, PROTOCOLS["dnerf"].background, PROTOCOLS["dnerf"].split) == (400, "white", "test")
+    assert (PROTOCOLS["dnerf"].resolution, PROTOCOLS["dnerf"].background, PROTOCOLS["dnerf"].split) == (
+        400,
+        "white",
+        "test",
+    )
     assert (PROTOCOLS["gs"].resolution, PROTOCOLS["gs"].background) == (800, "black")
     with pytest.raises(ValueError, match="protocol must be one of dnerf, gs; got 'nerf'"):
         find_protocol("nerf")

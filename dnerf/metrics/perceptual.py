@@ -15,8 +15,8 @@ BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 def lpips_metric(backbone: str = "alex", *, download: bool = False) -> Callable[[Tensor, Tensor], float]:
     """A function that gives the LPIPS distance of two pictures.
 
-    Source: Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric" (CVPR 2018), version 0.1
-    of its linear heads, which torchmetrics carries. Papers on D-NeRF use "alex" or "vgg" without saying which, and the
+    Source: Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric" (CVPR 2018), version
+    0.1 of its linear heads, which torchmetrics carries. Papers on D-NeRF use "alex" or "vgg" without saying which, and the
     two differ by a factor of about two: say which.
 
     Args:
@@ -24,7 +24,7 @@ def lpips_metric(backbone: str = "alex", *, download: bool = False) -> Callable[
         download: let torchvision fetch the backbone's weights (233 or 528 MB) if they are not there.
 
     Returns:
-        A function of prediction and target, (H, W, 3) in [0, 1], that returns a plain number; the prediction is clamped.
+        A function of prediction and target, (H, W, 3) in [0, 1], that returns a number; the prediction is clamped.
 
     Raises:
         ValueError: saying what to do, if the extra is not installed or the weights are not at hand.
@@ -41,7 +41,7 @@ def lpips_metric(backbone: str = "alex", *, download: bool = False) -> Callable[
             f"lpips: the weights of {backbone} are not at hand; put {BACKBONES[backbone]} into {weights.parent} "
             "or allow the download with lpips.download=true"
         )
-    network = LearnedPerceptualImagePatchSimilarity(net_type=backbone, normalize=True).eval()
+    network = LearnedPerceptualImagePatchSimilarity(net_type=backbone, normalize=True).eval()  # type: ignore[arg-type]
 
     @torch.no_grad()
     def distance(prediction: Tensor, target: Tensor) -> float:

@@ -1,7 +1,7 @@
 """How steady a sequence is: along its motion, over time at one place, and in depth.
 
-Pictures are (H, W, C) floats. Motion vectors `flow` (H, W, 2) say for each pixel of the first picture how many pixels to
-the right and down its matter lies in the second; `visible` (H, W) says where that matter is seen in both.
+Pictures are (H, W, C) floats. Motion vectors `flow` (H, W, 2) say for each pixel of the first picture how many pixels
+to the right and down its matter lies in the second; `visible` (H, W) says where that matter is seen in both.
 """
 
 import torch

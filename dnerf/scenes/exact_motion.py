@@ -1,7 +1,7 @@
 """What is seen moves exactly: motion vectors, occlusion and tracks of the surfaces of analytic scenes.
 
-Bodies count as opaque here: a pixel shows the first surface its ray meets. In the pictures they are fog of density 80 (or
-thin fog, in `pulsing_fog`), which is seen 1 / 80 of a unit deep on average.
+Bodies count as opaque here: a pixel shows the first surface its ray meets. In the pictures they are fog of density 80
+(or thin fog, in `pulsing_fog`), which is seen 1 / 80 of a unit deep on average.
 """
 
 from collections.abc import Sequence
@@ -158,7 +158,9 @@ class ExactTracks:
     times: tuple[float, ...]
 
 
-def exact_tracks(scene: AnalyticScene, cameras: Sequence[Camera], times: Sequence[float], pixels: Tensor) -> ExactTracks:
+def exact_tracks(
+    scene: AnalyticScene, cameras: Sequence[Camera], times: Sequence[float], pixels: Tensor
+) -> ExactTracks:
     """Follow what is seen at some pixels of the first picture through all times, exactly.
 
     Args:

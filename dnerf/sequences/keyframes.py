@@ -1,5 +1,6 @@
-"""Key frames in a JSON file that a person writes by hand: where the camera is and what time it is, every now and then."""
+"""Key frames in a JSON file that a person writes by hand: where the camera is and what time it is, now and then."""
 
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -131,7 +132,7 @@ def parse_key_frames(content: Any) -> KeyFrames:
     check_choice("interpolation", kind, INTERPOLATIONS)
     keys = [_parse_key(f"keyframes[{i}]", entry) for i, entry in enumerate(content["keyframes"])]
     seconds = [key["seconds"][0] for key in keys]
-    for i, (before, after) in enumerate(zip(seconds, seconds[1:])):
+    for i, (before, after) in enumerate(itertools.pairwise(seconds)):
         if not before < after:
             raise ValueError(f"keyframes[{i + 1}].seconds must be more than {before}, got {after}")
     channels = {}

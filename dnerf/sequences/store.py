@@ -91,6 +91,8 @@ def write_npz(store: FrameStore, path: Path, extra: Layers) -> Path:
                 np.lib.format.write_array_header_1_0(member, header)
                 for index, frame in enumerate(store):
                     if name not in frame or (frame[name].shape, frame[name].dtype) != (layer.shape, layer.dtype):
-                        raise ValueError(f"{store.path(index)}: {name} must be {layer.dtype} {layer.shape} as in frame 0")
+                        raise ValueError(
+                            f"{store.path(index)}: {name} must be {layer.dtype} {layer.shape} as in frame 0"
+                        )
                     member.write(np.ascontiguousarray(frame[name]).tobytes())
     return Path(path)

@@ -70,9 +70,7 @@ def slow_motion_times(
         return times + (factor - 1) * window
 
     first, last = frames_until(torch.tensor([start, end], dtype=torch.float64)).tolist()
-    wanted = torch.tensor(
-        [first + (last - first) * s for s in sweep_times(num_frames)], dtype=torch.float64
-    )
+    wanted = torch.tensor([first + (last - first) * s for s in sweep_times(num_frames)], dtype=torch.float64)
     low = torch.full_like(wanted, min(start, end))
     high = torch.full_like(wanted, max(start, end))
     for _ in range(60):

@@ -77,8 +77,8 @@ def training_points(scene: AnalyticScene, count: int = 1 << 16) -> Tensor:
 def fitted(pair: str, scene_name: str, num_steps: int = 80) -> Renderer:
     """A pair fitted to an exact scene: seeded regression on density and colour at random points and times.
 
-    A second of it gives a pair that moves in earnest, though roughly: enough for the checks that ask how it moves rather
-    than whether it is right. Densities are compared by what they hide over half a unit.
+    A second of it gives a pair that moves in earnest, though roughly: enough for the checks that ask how it moves
+    rather than whether it is right. Densities are compared by what they hide over half a unit.
     """
     torch.manual_seed(0)
     deformation, canonical = PAIRS[pair]()
@@ -105,7 +105,7 @@ def fitted(pair: str, scene_name: str, num_steps: int = 80) -> Renderer:
 
 @cache
 def trained(pair: str, scene_name: str, num_steps: int = 500) -> Renderer:
-    """A pair trained on exact pictures as a user would, about 20 seconds: for the checks that ask whether it is right."""
+    """A pair trained on exact pictures as a user would, some 20 seconds: for checks that ask whether it is right."""
     torch.manual_seed(0)
     deformation, canonical = PAIRS[pair]()
     sampler = OccupancySampler(BOX, 0.04, 32, num_slabs=NUM_SLABS, num_probes=1 << 15, decay=0.6)

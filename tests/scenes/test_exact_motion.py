@@ -128,9 +128,7 @@ def test_matter_has_its_colour_where_the_vectors_lead(name: str) -> None:
 
     def colour(camera: Camera, pixels: Tensor, time: float) -> Tensor:
         times = torch.full((len(pixels),), time, dtype=torch.float64)
-        rays = camera_rays(
-            INTRINSICS, camera.pose.double(), pixels[:, 0], pixels[:, 1], times=times, near=2.0, far=6.0
-        )
+        rays = camera_rays(INTRINSICS, camera.pose.double(), pixels[:, 0], pixels[:, 1], times=times, near=2.0, far=6.0)
         return render_exact(scene, rays)[0]
 
     difference = (colour(FIRST, here, T0) - colour(SECOND, there, T1)).abs().amax(-1)
@@ -221,7 +219,7 @@ def test_tracks_are_the_vectors_of_every_time(name: str) -> None:
 
 def test_what_cannot_be_followed_is_named() -> None:
     scene = make_scene("static")
-    with pytest.raises(ValueError, match="pixels must show matter at time 0.0, none of 1 does"):
+    with pytest.raises(ValueError, match=r"pixels must show matter at time 0\.0, none of 1 does"):
         exact_tracks(scene, [FIRST], [0.0], torch.zeros(1, 2))
     with pytest.raises(ValueError, match="cameras and times must be equally many"):
         exact_tracks(scene, [FIRST], [0.0, 0.5], torch.zeros(1, 2))

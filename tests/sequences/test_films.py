@@ -192,14 +192,14 @@ def test_raw_arrays_hold_every_frame_and_camera(tmp_path: Path) -> None:
 def test_damaged_and_missing_frames_are_named(tmp_path: Path) -> None:
     store = FrameStore(tmp_path, 2)
     store.write(0, {"rgb": np.zeros((2, 2, 3), np.uint8)})
-    with pytest.raises(ValueError, match="frame_00001.npz: not a readable frame"):
+    with pytest.raises(ValueError, match=r"frame_00001\.npz: not a readable frame"):
         list(store)
     store.write(1, {"rgb": np.zeros((2, 3, 3), np.uint8)})
-    with pytest.raises(ValueError, match="frame_00001.npz: rgb must be uint8"):
+    with pytest.raises(ValueError, match=r"frame_00001\.npz: rgb must be uint8"):
         write_npz(store, tmp_path / "a.npz", {})
     assert not (tmp_path / "a.npz").exists()
     store.path(1).write_bytes(store.path(1).read_bytes()[:100])
-    with pytest.raises(ValueError, match="frame_00001.npz: not a readable frame"):
+    with pytest.raises(ValueError, match=r"frame_00001\.npz: not a readable frame"):
         store.read(1)
 
 

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import pytest
@@ -23,7 +24,7 @@ def test_slow_motion_runs_at_the_stated_pace(center: float, width: float, factor
     times = slow_motion_times(2001, center=center, width=width, factor=factor)
     assert times[0] == pytest.approx(0, abs=1e-12)
     assert times[-1] == pytest.approx(1, abs=1e-12)
-    steps = [b - a for a, b in zip(times, times[1:])]
+    steps = [b - a for a, b in itertools.pairwise(times)]
     outside = steps[-1]  # t = 1 lies outside the slow stretch of all cases
     for time, step in zip(times, steps):
         u = (time + step / 2 - center) / width
