@@ -15,9 +15,9 @@ BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 def lpips_metric(backbone: str = "alex", *, download: bool = False) -> Callable[[Tensor, Tensor], float]:
     """A function that gives the LPIPS distance of two pictures.
 
-    Source: Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric" (CVPR 2018), version
-    0.1 of its linear heads, which torchmetrics carries. Papers on D-NeRF use "alex" or "vgg" without saying which, and the
-    two differ by a factor of about two: say which.
+    Source: Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric" (CVPR 2018), with
+    version 0.1 of its linear heads, which torchmetrics carries. Distances of the two backbones are not comparable:
+    say which.
 
     Args:
         backbone: "alex" or "vgg".
