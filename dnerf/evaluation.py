@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from statistics import fmean
 
 import torch
@@ -25,12 +25,14 @@ class FrameScore:
         time: in [0, 1].
         psnr: in dB, at most `MAX_PSNR` (identical pictures would be infinite).
         ssim: in [-1, 1].
+        lpips: distance >= 0, or None if it was not asked for.
     """
 
     index: int
     time: float
     psnr: float
     ssim: float
+    lpips: float | None = None
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Evaluation:
         num_frames: number of frames.
         seconds_per_frame: mean wall-clock seconds to render one.
         frames: each frame's score.
+        lpips: mean of the frames' LPIPS, or None.
     """
 
     split: str
@@ -52,10 +55,13 @@ class Evaluation:
     num_frames: int
     seconds_per_frame: float
     frames: Sequence[FrameScore]
+    lpips: float | None = None
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values, ready for JSON."""
-        return asdict(self)
+        """Plain values, ready for JSON; what was not measured is left out."""
+        values = {name: value for name, value in asdict(self).items() if value is not None}
+        values["frames"] = [{k: v for k, v in asdict(frame).items() if v is not None} for frame in self.frames]
+        return values
 
 
 FrameCallback = Callable[[FrameScore, Tensor, Tensor], None]
@@ -69,6 +75,7 @@ def evaluate(
     chunk: int = 16384,
     max_frames: int | None = None,
     on_frame: FrameCallback | None = None,
+    lpips: Callable[[Tensor, Tensor], float] | None = None,
 ) -> Evaluation:
     """Render frames and compare them with the truth on the renderer's own (evaluation) background.
 
@@ -81,6 +88,7 @@ def evaluate(
         chunk: rays rendered at a time.
         max_frames: score at most so many, spread evenly over the split; None scores all.
         on_frame: called with score, prediction (H, W, 3) and truth (H, W, 3) of every frame.
+        lpips: gives the distance of two pictures, see `dnerf.metrics.perceptual`; None leaves it out.
     """
     device = renderer.device
     frames = frames.to(device)
@@ -97,10 +105,13 @@ def evaluate(
         seconds += time.perf_counter() - begin
         truth = frames.image(i, background)
         score = FrameScore(i, moment, min(psnr(prediction, truth), MAX_PSNR), ssim(prediction, truth))
+        if lpips is not None:
+            score = replace(score, lpips=lpips(prediction, truth))
         scores.append(score)
         if on_frame is not None:
             on_frame(score, prediction, truth)
     renderer.train(was_training)
+    distances = [score.lpips for score in scores if score.lpips is not None]
     return Evaluation(
         split=split,
         psnr=fmean(s.psnr for s in scores),
@@ -108,6 +119,7 @@ def evaluate(
         num_frames=len(scores),
         seconds_per_frame=seconds / len(scores),
         frames=scores,
+        lpips=fmean(distances) if distances else None,
     )
 
 

@@ -1,61 +1,144 @@
 """Render a sequence of a run: python scripts/render.py run=runs/mutant path=orbit num_frames=60 format=mp4"""
 
+import hashlib
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 
 import torch
+import torch.distributed
 from hydra_app import build, load_config, load_renderer, resolve_device, run_app
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import Tensor
 from tqdm import tqdm
 
-from dnerf.cameras import Camera, fixed_path, look_at, orbit_path, spiral_path
+from dnerf.cameras import Intrinsics, fixed_path, look_at, orbit_path, spiral_path
 from dnerf.checks import check_choice, check_positive
-from dnerf.data.frames import Frames
+from dnerf.data import DataSource, Frames, SyntheticData, render_exact
 from dnerf.renderer import Renderer
-from dnerf.video import FORMATS, to_uint8, write_frames
+from dnerf.sequences import (
+    FILM_FORMATS,
+    FrameStore,
+    Share,
+    View,
+    check_outputs,
+    make_views,
+    pingpong_times,
+    read_key_frames,
+    render_frames_to,
+    sequence_digest,
+    slow_motion_times,
+    sweep_times,
+    write_films,
+    write_plan,
+)
+
+TIME_PATHS = ("sweep", "pingpong", "slow")
 
 
 def main(config: DictConfig) -> None:
-    """Load the run, follow the path, write the sequence."""
+    """Load the run, follow the path, render what is missing, write the films."""
     check_positive("num_frames", config.num_frames)
     check_positive("fps", config.fps)
-    check_choice("format", config.format, FORMATS)
+    outputs, formats = _listed(config.outputs), _listed(config.format)
+    check_outputs(outputs)
+    for format in formats:
+        check_choice("format", format, FILM_FORMATS)
     saved = load_config(config.run)
     if config.data_root is not None:
         saved.data.root = config.data_root
-    device = resolve_device(config.device)
+    share = Share(int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
+    device = _own_device(config.device)
     renderer = load_renderer(config.run, saved, device)
-    frames = build(saved.data).frames(config.path.get("split", "test"))
-    poses, own_times = _poses(config, frames)
-    times = _times(config.time, len(poses), own_times)
-    suffix = "" if config.format == "png" else f".{config.format}"
-    output = Path(config.output or Path(config.run) / "renders" / f"{config.path.name}{suffix}")
-    pictures = _pictures(renderer, frames, poses.to(device), times, config.resolution, config.chunk or saved.chunk)
-    write_frames(tqdm(pictures, total=len(poses), unit="frame"), output, config.format, fps=config.fps)
-    print(f"{len(poses)} frames: {output}")
+    data = build(saved.data)
+    frames = data.frames(config.path.get("split", "test"))
+    views = _views(config, frames, device)
+    chunk = config.chunk or saved.chunk
+    facts = {"model": _fingerprint(config.run), "outputs": outputs, "chunk": chunk, "device": device.type}
+    path = _output(config, formats)
+    store = FrameStore(path.parent / f".{path.name}.{sequence_digest(views, facts)}", len(views))
+    truth = _truth(data, frames, renderer, same_size=config.resolution is None) if "compare" in outputs else None
+    if share.size > 1:
+        torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))
+    if share.rank == 0:
+        write_plan(store, views, facts)
+    missing = [i for i in store.missing() if share.mine(i)]
+    kept = len(views) - len(store.missing())
+    if kept and share.rank == 0:
+        print(f"{kept} of {len(views)} frames are there already")
+    with tqdm(total=len(missing), unit="frame", disable=share.rank > 0, dynamic_ncols=True) as bar:
+        render_frames_to(
+            store, renderer, views, outputs, truth=truth, chunk=chunk, share=share, on_frame=lambda _: bar.update()
+        )
+    if share.size > 1:
+        torch.distributed.barrier()
+        torch.distributed.destroy_process_group()
+    if share.rank == 0:
+        for written in write_films(store, path, outputs, formats, fps=config.fps, views=views):
+            print(f"{len(views)} frames: {written}")
+        if not config.keep_frames:
+            store.remove()
 
 
-def _pictures(
-    renderer: Renderer, frames: Frames, poses: Tensor, times: list[float], resolution: int | None, chunk: int
-) -> Iterator[Tensor]:
-    intrinsics = frames.intrinsics
-    if resolution is not None:
+def _listed(value: str | ListConfig) -> list[str]:
+    return [value] if isinstance(value, str) else list(value)
+
+
+def _own_device(name: str) -> torch.device:
+    device = resolve_device(name)
+    if device == torch.device("cuda") and "LOCAL_RANK" in os.environ:
+        return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+    return device
+
+
+def _output(config: DictConfig, formats: list[str]) -> Path:
+    path = Path(config.output or Path(config.run) / "renders" / config.path.name)
+    return path.with_suffix("") if path.suffix[1:] in formats else path
+
+
+def _fingerprint(run: str) -> str:
+    digest = hashlib.sha256((Path(run) / "config.yaml").read_bytes())
+    digest.update((Path(run) / "model.safetensors").read_bytes())
+    return digest.hexdigest()
+
+
+def _views(config: DictConfig, frames: Frames, device: torch.device) -> list[View]:
+    intrinsics = _resized(frames.intrinsics, config.resolution)
+    angles: list[float | None] | None = None
+    own_times: list[float] | None = None
+    if config.path.name == "keyframes":
+        keys = read_key_frames(config.path.file)
+        poses, times, angles = keys.sample(config.fps)
+        own_times = times if "time" in keys.channels else None
+    elif config.path.name == "test":
+        poses, own_times = frames.poses, frames.times.tolist()
+    else:
+        poses = _poses(config, frames)
+    times = own_times if config.time is None and own_times is not None else _times(config, len(poses))
+    have_truth = config.path.name == "test" and times is own_times
+    return make_views(
+        poses.to(device), times, intrinsics, frames.near, frames.far, angles=angles, have_truth=have_truth
+    )
+
+
+def _resized(intrinsics: Intrinsics, resolution: int | ListConfig | None) -> Intrinsics:
+    if resolution is None:
+        return intrinsics
+    if isinstance(resolution, int):
         check_positive("resolution", resolution)
-        intrinsics = intrinsics.resized(resolution, round(resolution * intrinsics.height / intrinsics.width))
-    for pose, time in zip(poses, times):
-        camera = Camera(intrinsics, pose, frames.near, frames.far)
-        yield to_uint8(renderer.render_image(camera, time, chunk=chunk).rgb)
+        return intrinsics.resized(resolution, round(resolution * intrinsics.height / intrinsics.width))
+    if len(resolution) != 2:
+        raise ValueError(f"resolution must be a width or [width,height], got {list(resolution)}")
+    angle = 2 * math.atan(0.5 * intrinsics.width / intrinsics.focal_x)
+    return Intrinsics.from_angle(resolution[0], resolution[1], angle, intrinsics.pixel_origin)
 
 
-def _poses(config: DictConfig, frames: Frames) -> tuple[Tensor, list[float] | None]:
-    """Poses of the path, and the times that belong to them if the path has its own."""
+def _poses(config: DictConfig, frames: Frames) -> Tensor:
     path, count = config.path, config.num_frames
-    if path.name == "test":
-        return frames.poses, frames.times.tolist()
     if path.name == "fixed":
-        return fixed_path(count, _fixed_pose(path, frames)), None
+        return fixed_path(count, _fixed_pose(path, frames))
     placed = {
         "radius": path.radius,
         "target": list(path.target),
@@ -63,9 +146,9 @@ def _poses(config: DictConfig, frames: Frames) -> tuple[Tensor, list[float] | No
         "start_angle": math.radians(path.start_angle),
     }
     if path.name == "orbit":
-        return orbit_path(count, elevation=math.radians(path.elevation), **placed), None
+        return orbit_path(count, elevation=math.radians(path.elevation), **placed)
     low, high = (math.radians(angle) for angle in path.elevations)
-    return spiral_path(count, elevations=(low, high), **placed), None
+    return spiral_path(count, elevations=(low, high), **placed)
 
 
 def _fixed_pose(path: DictConfig, frames: Frames) -> Tensor:
@@ -79,18 +162,43 @@ def _fixed_pose(path: DictConfig, frames: Frames) -> Tensor:
     return look_at([t + path.radius * o for t, o in zip(path.target, offset)], list(path.target))
 
 
-def _times(time: str | float, count: int, own_times: list[float] | None) -> list[float]:
-    if isinstance(time, str):
-        check_choice("time", time, ("sweep", "pingpong"))
-        if time == "sweep" and own_times is not None:
-            return own_times
-        phases = torch.arange(count, dtype=torch.float64)
-        if time == "sweep":
-            return (phases / max(count - 1, 1)).tolist()
-        return (1 - (1 - 2 * phases / count).abs()).tolist()
-    if not 0 <= time <= 1:
-        raise ValueError(f"time must be sweep, pingpong or a number in [0, 1], got {time}")
-    return [float(time)] * count
+def _times(config: DictConfig, count: int) -> list[float]:
+    time = "sweep" if config.time is None else config.time
+    if not isinstance(time, str):
+        if not 0 <= time <= 1:
+            raise ValueError(f"time must be {', '.join(TIME_PATHS)} or a number in [0, 1], got {time}")
+        return [float(time)] * count
+    check_choice("time", time, TIME_PATHS)
+    if len(config.time_range) != 2:
+        raise ValueError(f"time_range must be two times, got {list(config.time_range)}")
+    start, end = config.time_range
+    if time == "slow":
+        slow = OmegaConf.to_container(config.slow_motion)
+        assert isinstance(slow, dict)
+        return slow_motion_times(count, start=start, end=end, **{str(name): value for name, value in slow.items()})
+    return (sweep_times if time == "sweep" else pingpong_times)(count, start, end)
+
+
+def _truth(data: DataSource, frames: Frames, renderer: Renderer, *, same_size: bool) -> Callable[[View], Tensor] | None:
+    """What gives the true picture of a view: the data's own picture, or the exact scene; None if neither does."""
+    background = renderer.background(torch.zeros(1, 3, device=renderer.device))[0]
+    if isinstance(data, SyntheticData):
+        scene = data.scene.to(renderer.device)
+
+        def exact(view: View) -> Tensor:
+            shape = (view.camera.intrinsics.height, view.camera.intrinsics.width, 3)
+            return render_exact(scene, view.camera.rays(view.time), background)[0].reshape(shape)
+
+        return exact
+
+    def picture(view: View) -> Tensor:
+        if view.truth_index is None or not same_size:
+            raise ValueError(
+                "outputs: compare needs true pictures: path=test at the data's own resolution, or an exact scene"
+            )
+        return frames.image(view.truth_index, background.cpu())
+
+    return picture
 
 
 if __name__ == "__main__":

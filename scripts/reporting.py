@@ -1,14 +1,18 @@
 """What training and evaluation both report: metrics.json, a contact sheet, a table."""
 
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
+from dnerf.backgrounds import COLORS
 from dnerf.data import DataSource
 from dnerf.evaluation import FrameScore, evaluate, scores_by_time, spread_indices
 from dnerf.files import write_json
 from dnerf.logs import SHEET_COLUMNS
+from dnerf.provenance import provenance
 from dnerf.renderer import Renderer
 from dnerf.video import contact_sheet, error_map, write_png
 
@@ -23,8 +27,22 @@ def evaluate_run(
     *,
     max_frames: int | None = None,
     chunk: int = 16384,
+    settings: Mapping[str, object] | None = None,
+    name: str = "metrics.json",
+    lpips: Callable[[Tensor, Tensor], float] | None = None,
 ) -> dict[str, object]:
-    """Score a run on a split, or on so many of its frames; write `metrics.json` and a contact sheet into its folder.
+    """Score a run on a split, or on so many of its frames; write the scores and a contact sheet into its folder.
+
+    Args:
+        folder: of the run.
+        renderer: its model.
+        data: its scene.
+        split: what is scored.
+        max_frames: score at most so many frames.
+        chunk: rays at a time.
+        settings: more facts for the scores' file (scene, protocol, method).
+        name: of the scores' file.
+        lpips: see `dnerf.evaluation.evaluate`.
 
     Raises:
         ValueError: if `training.json` is missing or broken.
@@ -41,13 +59,25 @@ def evaluate_run(
             rows.append([prediction, truth, error_map(prediction, truth)])
             labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")
 
-    evaluation = evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep)
-    metrics = {**evaluation.as_dict(), **training}
+    evaluation = evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep, lpips=lpips)
+    metrics = {
+        **evaluation.as_dict(),
+        **training,
+        "resolution": frames.intrinsics.width,
+        "background": _color_name(renderer),
+        **(settings or {}),
+        **provenance(),
+    }
     if data.train_end is not None:
         metrics |= {"train_end": data.train_end, **scores_by_time(evaluation.frames, data.train_end)}
     write_png(contact_sheet(rows, columns=SHEET_COLUMNS, rows=labels), sheet_path(folder, split))
-    write_json(folder / "metrics.json", metrics)
+    write_json(folder / name, metrics)
     return metrics
+
+
+def _color_name(renderer: Renderer) -> str:
+    color = tuple(renderer.background(torch.zeros(1, 3, device=renderer.device))[0].tolist())
+    return next((name for name, known in COLORS.items() if known == color), str(color))
 
 
 def sheet_path(folder: Path, split: str) -> Path:
@@ -71,7 +101,7 @@ def read_training(folder: Path) -> dict[str, object]:
     return values
 
 
-def print_scores(metrics: dict[str, object], folder: Path) -> None:
+def print_scores(metrics: dict[str, object], folder: Path, name: str = "metrics.json") -> None:
     """Print a table of the frames' scores, their mean, and where the files are."""
     frames = metrics["frames"]
     assert isinstance(frames, list)
@@ -88,5 +118,5 @@ def print_scores(metrics: dict[str, object], folder: Path) -> None:
         f"trained {metrics['train_seconds']:.0f} s, {metrics['num_steps']} steps, "
         f"{metrics['num_parameters']:,} parameters"
     )
-    print(f"scores:        {folder / 'metrics.json'}")
+    print(f"scores:        {folder / name}")
     print(f"contact sheet: {sheet_path(folder, str(metrics['split']))}")

@@ -12,6 +12,7 @@ from reporting import evaluate_run, print_scores
 from dnerf.checkpoints import save_weights
 from dnerf.files import write_json
 from dnerf.logs import JsonLinesLog, Previews, TensorBoardLog, tensorboard_writer
+from dnerf.provenance import commit, hardware
 
 
 def main(config: DictConfig) -> None:
@@ -34,6 +35,8 @@ def main(config: DictConfig) -> None:
         "num_steps": record.step,
         "num_parameters": num_parameters,
         "seed": config.seed,
+        "train_hardware": hardware(),
+        "train_commit": commit(),
     }
     write_json(folder / "training.json", training)
     if with_writer is not None:

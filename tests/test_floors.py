@@ -16,6 +16,7 @@ FLOORS = {
     "files": 0,
     "geometry": 0,
     "mlp": 0,
+    "provenance": 0,
     "rays": 0,
     # 1: one ray at a time.
     "backgrounds": 1,
@@ -32,17 +33,24 @@ FLOORS = {
     "metrics": 6,
     "motion": 6,
     "motion_losses": 6,
+    "plots": 6,
+    "protocols": 6,
+    "visualisation": 6,
     # 7: whole runs.
-    "benchmarks": 7,
     "checkpoints": 7,
+    "consistency": 7,
     "distributed": 7,
     "evaluation": 7,
     "logs": 7,
     "report": 7,
+    "sequences": 7,
+    "temporal_evaluation": 7,
     "tracks": 7,
     "training": 7,
     "video": 7,
     "viewer": 7,
+    # 8: looks at all of them from outside.
+    "benchmarks": 8,
 }
 
 # Imports within a floor, each deliberate: `checks` is the ground of floor 0, compositing is built on its kernels,
@@ -59,6 +67,9 @@ WITHIN_A_FLOOR = {
     ("motion_losses", "losses"),
     ("tracks", "video"),
     ("rays", "checks"),
+    ("sequences", "logs"),
+    ("sequences", "video"),
+    ("temporal_evaluation", "evaluation"),
 }
 
 ONLY_SCRIPTS_KNOW = {"hydra", "omegaconf"}

@@ -1,1 +1,20 @@
-"""Measurements: functions that return rows of a table."""
+"""Benchmarks: suites by name, each returning tables and plots, and one writer for their reports.
+
+A new suite is one module here with `run(settings)`; `scripts/benchmark.py suite=<module>` then finds it.
+"""
+
+from dnerf.benchmarks.machine import describe_machine
+from dnerf.benchmarks.report import write_report
+from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table, run_suite, suite_names
+
+__all__ = [
+    "Plot",
+    "Series",
+    "Settings",
+    "SuiteResult",
+    "Table",
+    "describe_machine",
+    "run_suite",
+    "suite_names",
+    "write_report",
+]

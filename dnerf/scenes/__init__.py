@@ -4,9 +4,16 @@ from collections.abc import Callable
 
 from dnerf.checks import check_choice
 from dnerf.scenes.base import AnalyticScene
+from dnerf.scenes.bending_rod import make_bending_rod
 from dnerf.scenes.bodies import Body
+from dnerf.scenes.dense_fog import make_dense_fog
+from dnerf.scenes.exact_motion import ExactFlow, ExactTracks, exact_flow, exact_tracks, first_surfaces, is_visible
+from dnerf.scenes.fast_ball import make_fast_ball
 from dnerf.scenes.glossy_ball import make_glossy_ball
-from dnerf.scenes.motions import Fixed, Joint, Motion, Orbit, Pulse, Slide, Spin, Wave
+from dnerf.scenes.jumping_ball import make_jumping_ball
+from dnerf.scenes.merging_balls import make_merging_balls
+from dnerf.scenes.motions import Fixed, Joint, Jump, Motion, Orbit, Pulse, Slide, Spin, Vanish, Wave
+from dnerf.scenes.opaque_wall import make_opaque_wall
 from dnerf.scenes.orbiting_balls import make_orbiting_balls
 from dnerf.scenes.poses import Pose
 from dnerf.scenes.pulsing_fog import make_pulsing_fog
@@ -25,13 +32,26 @@ from dnerf.scenes.textures import (
     grid_planes,
     sector_planes,
 )
+from dnerf.scenes.thin_rod import make_thin_rod
+from dnerf.scenes.twisting_block import make_twisting_block
+from dnerf.scenes.vanishing_ball import make_vanishing_ball
 from dnerf.scenes.walker import make_walker
+from dnerf.scenes.warps import Bend, Twist, Warp
 
 SCENES: dict[str, Callable[[], AnalyticScene]] = {
+    "bending_rod": make_bending_rod,
+    "dense_fog": make_dense_fog,
+    "fast_ball": make_fast_ball,
     "glossy_ball": make_glossy_ball,
+    "jumping_ball": make_jumping_ball,
+    "merging_balls": make_merging_balls,
+    "opaque_wall": make_opaque_wall,
     "orbiting_balls": make_orbiting_balls,
     "pulsing_fog": make_pulsing_fog,
     "static": make_static,
+    "thin_rod": make_thin_rod,
+    "twisting_block": make_twisting_block,
+    "vanishing_ball": make_vanishing_ball,
     "walker": make_walker,
 }
 """Scenes by name, each built with its defaults."""
@@ -51,15 +71,19 @@ __all__ = [
     "SCENES",
     "AnalyticScene",
     "Ball",
+    "Bend",
     "Body",
     "Box",
     "Capsule",
     "Checker",
+    "ExactFlow",
+    "ExactTracks",
     "Fixed",
     "Glossy",
     "Glow",
     "Gradient",
     "Joint",
+    "Jump",
     "Lit",
     "Motion",
     "Orbit",
@@ -72,13 +96,29 @@ __all__ = [
     "Spin",
     "Stripes",
     "Texture",
+    "Twist",
+    "Vanish",
+    "Warp",
     "Wave",
+    "exact_flow",
+    "exact_tracks",
+    "first_surfaces",
     "grid_planes",
+    "is_visible",
+    "make_bending_rod",
+    "make_dense_fog",
+    "make_fast_ball",
     "make_glossy_ball",
+    "make_jumping_ball",
+    "make_merging_balls",
+    "make_opaque_wall",
     "make_orbiting_balls",
     "make_pulsing_fog",
     "make_scene",
     "make_static",
+    "make_thin_rod",
+    "make_twisting_block",
+    "make_vanishing_ball",
     "make_walker",
     "sector_planes",
 ]

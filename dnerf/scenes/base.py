@@ -48,7 +48,7 @@ class AnalyticScene(RadianceField):
         """
         check_batch("times", times, positions)
         shape, positions = positions.shape[:-1], positions.reshape(-1, 3)
-        inside = [body.shape.contains(pose.to_local(positions)) for body, pose in self._posed(times.reshape(-1))]
+        inside = [body.contains(pose, positions) for body, pose in self._posed(times.reshape(-1))]
         return torch.stack(inside, dim=-1).reshape(*shape, len(self.bodies))
 
     def body_indices(self, positions: Tensor, times: Tensor) -> Tensor:
@@ -137,24 +137,28 @@ class AnalyticScene(RadianceField):
         far = torch.maximum(rays.near, rays.far)
         spans = []
         for body, pose in posed:
-            enter, leave = body.intersect(pose, rays.origins, rays.directions)
-            enter, leave = torch.maximum(enter, rays.near), torch.minimum(leave, far)
+            enter, leave = body.spans(pose, rays.origins, rays.directions, rays.near, far)
+            enter, leave = torch.maximum(enter, rays.near[:, None]), torch.minimum(leave, far[:, None])
             hits = leave > enter
-            spans.append((torch.where(hits, enter, rays.near), torch.where(hits, leave, rays.near)))
-        hit_indices = torch.stack([leave > enter for enter, leave in spans]).any(0).nonzero()[:, 0]
+            spans.append((torch.where(hits, enter, rays.near[:, None]), torch.where(hits, leave, rays.near[:, None])))
+        hit_indices = torch.cat([leave > enter for enter, leave in spans], dim=-1).any(-1).nonzero()[:, 0]
         origins, directions = rays.origins[hit_indices], rays.directions[hit_indices]
         edges, matter = [], []
         for (body, pose), (enter, leave) in zip(posed, spans):
             pose = pose.take(hit_indices)
-            enter, leave = enter[hit_indices, None], leave[hit_indices, None]
+            enter, leave = enter[hit_indices], leave[hit_indices]
             breaks = body.breaks(pose, origins, directions)
-            edges += [enter, leave, torch.minimum(torch.maximum(breaks, enter), leave)]
+            first, last = enter.amin(-1, keepdim=True), leave.amax(-1, keepdim=True)
+            pieces = [torch.lerp(enter, leave, k / pose.num_pieces) for k in range(1, pose.num_pieces)]
+            edges += [enter, leave, torch.minimum(torch.maximum(breaks, first), last), *pieces]
             matter.append((enter, leave, body.density_at(pose)[:, None]))
         edge = torch.cat(edges, dim=-1).sort(dim=-1).values
         starts, ends = edge[:, :-1], edge[:, 1:]
         density = torch.zeros_like(starts)
         for enter, leave, own in matter:
-            density = density + torch.where((enter <= starts) & (ends <= leave), own, 0.0)
+            for k in range(enter.shape[-1]):
+                within = (enter[:, k, None] <= starts) & (ends <= leave[:, k, None])
+                density = density + torch.where(within, own, 0.0)
         return _gauss_samples(starts, ends, density, hit_indices, len(rays))
 
     def _posed(self, times: Tensor) -> Iterator[tuple[Body, Pose]]:

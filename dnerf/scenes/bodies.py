@@ -38,23 +38,24 @@ class Body:
 
     def density_at(self, pose: Pose) -> Tensor:
         """Density inside, (...,) like the pose, in 1 / world unit."""
-        if self.conserves_mass:
-            return self.density / pose.scale**3
-        return torch.full_like(pose.scale, self.density)
+        density = self.density / pose.scale**3 if self.conserves_mass else torch.full_like(pose.scale, self.density)
+        return density if pose.presence is None else density * pose.presence
+
+    def contains(self, pose: Pose, positions: Tensor) -> Tensor:
+        """Whether world positions (..., 3) lie inside, (...,) bool; never while the body is not there."""
+        inside = self.shape.contains(pose.to_local(positions))
+        return inside if pose.presence is None else inside & (pose.presence > 0)
 
     def color(self, points: Tensor, directions: Tensor) -> Tensor:
         """Colour (..., 3) at points and for unit viewing directions (..., 3) in the body's frame."""
         return self.texture.color(points, self.shape.normals(points), directions)
 
-    def intersect(self, pose: Pose, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances (R,) at which rays (R, 3) in the world enter and leave; `enter >= leave` if they miss."""
-        return self.shape.intersect(*_local_lines(pose, origins, directions))
+    def spans(
+        self, pose: Pose, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Distances (R, K) at which rays (R, 3) in the world enter and leave, see `Pose.spans`."""
+        return pose.spans(self.shape, origins, directions, near, far)
 
     def breaks(self, pose: Pose, origins: Tensor, directions: Tensor) -> Tensor:
         """Distances (R, M) at which the colour along rays (R, 3) in the world jumps."""
-        return self.texture.breaks(*_local_lines(pose, origins, directions))
-
-
-def _local_lines(pose: Pose, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Lines in the body's frame, run through at the same distances as in the world."""
-    return pose.to_local(origins), pose.directions_to_local(directions) / pose.scale[..., None]
+        return self.texture.breaks(*pose.local_lines(origins, directions))

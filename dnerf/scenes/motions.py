@@ -196,3 +196,56 @@ class Pulse(Motion):
         """The scaling."""
         identity = Pose.identity(times)
         return Pose(identity.rotation, identity.translation, self.scale(times))
+
+
+@dataclass(frozen=True)
+class Jump(Motion):
+    """A frame that stands still and jumps: discontinuous in time, and at t = 1 back where it was at t = 0.
+
+    Args:
+        places: of its origin, in the parent's frame, each for an equal share of [0, 1].
+        parent: motion of the frame it jumps in; the world if None.
+
+    Raises:
+        ValueError: without places.
+    """
+
+    places: tuple[Vector, ...] = ((0.0, 0.0, 0.0),)
+    parent: Motion | None = None
+
+    def __post_init__(self) -> None:
+        if not self.places:
+            raise ValueError("places must hold at least one place, got none")
+
+    def relative(self, times: Tensor) -> Pose:
+        """The place of the moment."""
+        places = torch.tensor(self.places, dtype=times.dtype, device=times.device)
+        identity = Pose.identity(times)
+        index = (times.detach() * len(self.places)).long() % len(self.places)
+        return Pose(identity.rotation, places[index], identity.scale)
+
+
+@dataclass(frozen=True)
+class Vanish(Motion):
+    """A frame whose body is not there for a while.
+
+    Args:
+        gone: from when to when, within (0, 1); the end belongs to the time it is there again.
+        parent: motion of the frame; the world if None.
+
+    Raises:
+        ValueError: unless 0 < from < to < 1.
+    """
+
+    gone: tuple[float, float] = (0.4, 0.7)
+    parent: Motion | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.gone[0] < self.gone[1] < 1:
+            raise ValueError(f"gone must be two increasing times in (0, 1), got {self.gone}")
+
+    def relative(self, times: Tensor) -> Pose:
+        """The parent's own frame, present or not."""
+        identity = Pose.identity(times)
+        there = (times < self.gone[0]) | (times >= self.gone[1])
+        return Pose(identity.rotation, identity.translation, identity.scale, there.to(times.dtype))

@@ -1,11 +1,15 @@
 """Similarity poses: rotation, translation and uniform scale between a body's frame and the world."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
 from dnerf.geometry import skew
+
+if TYPE_CHECKING:
+    from dnerf.scenes.shapes import Shape
 
 
 def rotate(matrices: Tensor, vectors: Tensor) -> Tensor:
@@ -37,11 +41,16 @@ class Pose:
         rotation: (..., 3, 3).
         translation: (..., 3) in world units.
         scale: (...,) > 0.
+        presence: (...,) 1 while the body is there, 0 while it is not; None for always.
     """
+
+    num_pieces: ClassVar[int] = 1
+    """Equal parts of a body along a ray in each of which its colour is smooth enough for one Gauss rule."""
 
     rotation: Tensor
     translation: Tensor
     scale: Tensor
+    presence: Tensor | None = None
 
     @classmethod
     def identity(cls, times: Tensor) -> "Pose":
@@ -53,7 +62,14 @@ class Pose:
         """Poses of the given items; a single pose (1,) serves all items and stays single."""
         if len(self.scale) == 1:
             return self
-        return Pose(self.rotation[indices], self.translation[indices], self.scale[indices])
+        presence = None if self.presence is None else self.presence[indices]
+        return replace(
+            self,
+            rotation=self.rotation[indices],
+            translation=self.translation[indices],
+            scale=self.scale[indices],
+            presence=presence,
+        )
 
     def to_world(self, points: Tensor) -> Tensor:
         """Local points (..., 3) to the world."""
@@ -70,4 +86,30 @@ class Pose:
     def then(self, child: "Pose") -> "Pose":
         """Pose of a frame that is given relative to this one."""
         columns = [rotate(self.rotation, child.rotation[..., i]) for i in range(3)]
-        return Pose(torch.stack(columns, -1), self.to_world(child.translation), self.scale * child.scale)
+        found = [p for p in (self.presence, child.presence) if p is not None]
+        return replace(
+            child,
+            rotation=torch.stack(columns, -1),
+            translation=self.to_world(child.translation),
+            scale=self.scale * child.scale,
+            presence=found[0] * found[-1] if found else None,
+        )
+
+    def local_lines(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Lines (R, 3) of the world in the body's frame, run through at the same distances."""
+        return self.to_local(origins), self.directions_to_local(directions) / self.scale[..., None]
+
+    def spans(
+        self, shape: "Shape", origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Where rays are inside a shape: distances (R, K) at which they enter and leave, `enter >= leave` for none.
+
+        Args:
+            shape: in the body's frame; convex, so that K = 1 unless the frame is bent.
+            origins: (R, 3) in the world.
+            directions: (R, 3), unit norm.
+            near: (R,) distances before which nothing is asked.
+            far: (R,) distances after which nothing is asked.
+        """
+        enter, leave = shape.intersect(*self.local_lines(origins, directions))
+        return enter[:, None], leave[:, None]

@@ -25,6 +25,10 @@ class Shape(ABC):
         """Whether points (..., 3) lie inside, (...,) bool."""
 
     @abstractmethod
+    def excess(self, points: Tensor) -> Tensor:
+        """How far points (..., 3) are outside, (...,): <= 0 inside; it changes by at most 1 per unit of length."""
+
+    @abstractmethod
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Distances at which lines enter and leave, in units of the direction's length.
 
@@ -87,6 +91,10 @@ class Ball(Shape):
         """Within the radius."""
         return points.norm(dim=-1) <= self.radius
 
+    def excess(self, points: Tensor) -> Tensor:
+        """Distance from the surface, with its sign."""
+        return points.norm(dim=-1) - self.radius
+
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """The chord."""
         return _ball_crossing(origins, directions, self.radius)
@@ -115,6 +123,10 @@ class Box(Shape):
     def contains(self, points: Tensor) -> Tensor:
         """Between all three pairs of faces."""
         return (points.abs() <= constant(self.half_sizes, points)).all(-1)
+
+    def excess(self, points: Tensor) -> Tensor:
+        """By how much the worst coordinate is beyond its face."""
+        return (points.abs() - constant(self.half_sizes, points)).amax(-1)
 
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """The slab method."""
@@ -166,6 +178,11 @@ class Capsule(Shape):
         along, across = self._split(points)
         beyond = along - along.clamp(0, self.length)
         return torch.hypot(beyond, across.norm(dim=-1)) <= self.radius
+
+    def excess(self, points: Tensor) -> Tensor:
+        """Distance from the surface, with its sign."""
+        along, across = self._split(points)
+        return torch.hypot(along - along.clamp(0, self.length), across.norm(dim=-1)) - self.radius
 
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Hull of the crossings of its three convex parts, two balls and a cylinder: their union is convex."""

@@ -1,0 +1,144 @@
+"""What a scene needs: short trainings with one part removed at a time, and the smallest model that is enough."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+from dnerf.benchmarks.runs import Run, run_training
+from dnerf.benchmarks.scenes import scene_overrides
+from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
+
+TOLERANCE = 0.1  # dB below the best that still counts as good enough
+QUICK = {"seconds": 1, "seeds": [0], "resolution": 40, "frames": 2}
+FULL = "everything"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Mean scores of one configuration over the seeds."""
+
+    psnr: float
+    spread: float
+    step_ms: float
+    frame_s: float
+    peak_mib: float
+    num_parameters: int
+
+
+def run(settings: Settings) -> SuiteResult:
+    """Train with everything, without each part, and without all parts that were not missed."""
+    options = {**settings.options, **(QUICK if settings.quick else {})}
+    parts = dict(list(options["parts"].items())[:2] if settings.quick else options["parts"])
+    trial = _trainer(settings, options)
+    full = trial(FULL, [])
+    without = {name: trial(f"without {name}", overrides) for name, overrides in parts.items()}
+    best = max([full, *without.values()], key=lambda t: t.psnr)
+    removed, smallest = smallest_enough(full, without, parts, trial, best.psnr - TOLERANCE)
+    rows = [_row(FULL, full, full), *(_row(f"without {name}", t, full) for name, t in without.items())]
+    if len(removed) > 1:
+        rows.append(_row(f"without {', '.join(removed)}", smallest, full))
+    line = " ".join(_base(options) + [o for name in removed for o in parts[name]])
+    return SuiteResult(
+        title=f"What {options['scene']} needs",
+        summary=(
+            f"`experiment={options['experiment']}` on `{options['scene']}` with every part in place "
+            f"(`{' '.join(options['full'])}`), then with one part removed at a time, each trained for "
+            f"{options['seconds']:g} s and scored on {options['frames']} unseen frames of {options['resolution']} x "
+            f"{options['resolution']} pixels. All get the same time, so a part must earn what it costs. Parts whose "
+            f"removal loses at most {TOLERANCE} dB against the best are then removed together, and put back one by "
+            "one, the most valuable first, until the rest is within that of the best."
+        ),
+        tables=[
+            Table(
+                "Parts",
+                rows,
+                "buys_dB: what the removed part is worth; costs_ms and costs_MiB: what it takes per step and in peak "
+                "memory. Differences within the seeds' spread mean nothing.",
+            )
+        ],
+        plots=[_plot(rows, str(options["scene"]))],
+        findings=[f"Within {TOLERANCE} dB of the best ({best.psnr:.2f} dB): `{line}` ({smallest.psnr:.2f} dB)."],
+    )
+
+
+def smallest_enough(
+    full: Trial,
+    without: Mapping[str, Trial],
+    parts: Mapping[str, Sequence[str]],
+    trial: Callable[[str, Sequence[str]], Trial],
+    enough: float,
+) -> tuple[list[str], Trial]:
+    """Names of the parts that can go together, and what is left then.
+
+    Args:
+        full: scores with all parts.
+        without: scores with one part removed.
+        parts: overrides that remove each.
+        trial: trains and scores a name and its overrides.
+        enough: PSNR in dB that the result must reach; if nothing reaches it, all parts stay.
+    """
+    removed = sorted((name for name, t in without.items() if t.psnr >= enough), key=lambda n: without[n].psnr)
+    while len(removed) > 1:
+        together = trial(f"without {', '.join(removed)}", [o for name in removed for o in parts[name]])
+        if together.psnr >= enough:
+            return removed, together
+        removed = removed[1:]
+    return removed, without[removed[0]] if removed else full
+
+
+def _base(options: Mapping[str, Any]) -> list[str]:
+    return [f"experiment={options['experiment']}", *options["full"]]
+
+
+def _trainer(settings: Settings, options: Mapping[str, Any]) -> Callable[[str, Sequence[str]], Trial]:
+    scene = scene_overrides(options["scene"], options["resolution"], options["data_root"], settings.quick)
+    common = [
+        *_base(options), *scene, f"trainer.max_seconds={options['seconds']}", "trainer.num_steps=1000000000",
+        f"evaluate_frames={options['frames']}", f"evaluate_split={options['split']}", f"device={settings.device}",
+    ]  # fmt: skip
+
+    def train(name: str, overrides: Sequence[str]) -> Trial:
+        runs: list[Run] = []
+        for seed in options["seeds"]:
+            folder = settings.work_dir / f"{name.replace(' ', '_').replace(',', '')}-seed{seed}"
+            runs.append(run_training(settings.train_command, [*common, *overrides, f"seed={seed}"], folder))
+        return Trial(
+            psnr=fmean(r.psnr for r in runs),
+            spread=max(r.psnr for r in runs) - min(r.psnr for r in runs),
+            step_ms=fmean(r.step_ms for r in runs),
+            frame_s=fmean(r.seconds_per_frame for r in runs),
+            peak_mib=max(r.peak_mib for r in runs),
+            num_parameters=runs[0].num_parameters,
+        )
+
+    return train
+
+
+def _row(name: str, trial: Trial, full: Trial) -> dict[str, Any]:
+    is_full = trial is full
+    return {
+        "configuration": name,
+        "psnr": trial.psnr,
+        "spread_dB": trial.spread,
+        "buys_dB": None if is_full else full.psnr - trial.psnr,
+        "step_ms": trial.step_ms,
+        "costs_ms": None if is_full else full.step_ms - trial.step_ms,
+        "frame_s": trial.frame_s,
+        "peak_MiB": trial.peak_mib,
+        "costs_MiB": None if is_full else full.peak_mib - trial.peak_mib,
+        "parameters": trial.num_parameters,
+    }
+
+
+def _plot(rows: Sequence[Mapping[str, Any]], scene: str) -> Plot:
+    series = [Series(r["configuration"], [r["step_ms"]], [r["psnr"]], style="points") for r in rows]
+    return Plot(
+        name="needs",
+        title=f"What each part is worth on {scene}",
+        x_label="time per training step (ms)",
+        y_label="PSNR of unseen frames after equal time (dB)",
+        series=series,
+        y_log=False,
+        note="Up and to the left is better; a point as high as `everything` is a part that this scene does not need.",
+    )

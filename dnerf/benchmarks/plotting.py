@@ -1,0 +1,143 @@
+"""Plots that read without the text: units on the axes, every line labelled where it ends."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+from dnerf.benchmarks.suite import BarPlot, Plot, Series
+from dnerf.checks import check_choice
+from dnerf.files import atomic_path
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5195", "#4D4D4D")
+"""Okabe and Ito's colours, which the colour-blind tell apart, and two more."""
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+STYLES = ("line", "points", "guide")
+
+
+def draw(plot: Plot | BarPlot, path: Path) -> None:
+    """Write a plot as PNG.
+
+    Raises:
+        ValueError: without matplotlib, without a series, or for an unknown style.
+    """
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(figsize=(8.4, 5.0), dpi=120, layout="constrained")
+    try:
+        axes.set_title(plot.title, loc="left", fontsize=12, fontweight="bold")
+        axes.set_xlabel(plot.x_label)
+        axes.spines[["top", "right"]].set_visible(False)
+        if isinstance(plot, BarPlot):
+            _draw_bars(axes, plot)
+        else:
+            _draw_lines(figure, axes, plot)
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format="png")
+    finally:
+        pyplot.close(figure)
+
+
+def _draw_lines(figure: Any, axes: Any, plot: Plot) -> None:
+    if not plot.series:
+        raise ValueError(f"series of plot {plot.name!r} must hold at least one, got none")
+    ends = [_draw_series(axes, series, index) for index, series in enumerate(plot.series)]
+    axes.set_ylabel(plot.y_label)
+    if plot.x_log:
+        axes.set_xscale("log")
+        _plain_ticks(axes.xaxis, *axes.get_xlim())
+    if plot.y_log:
+        axes.set_yscale("log")
+        _plain_ticks(axes.yaxis, *axes.get_ylim())
+    axes.grid(True, which="major", color="#DDDDDD", linewidth=0.8)
+    _label_ends(figure, axes, [end for end in ends if end is not None])
+
+
+def _draw_bars(axes: Any, plot: BarPlot) -> None:
+    count = len(plot.values)
+    height = 0.8 / count
+    for index, (label, lengths) in enumerate(plot.values.items()):
+        places = [k - 0.4 + (index + 0.5) * height for k in range(len(plot.categories))]
+        bars = axes.barh(places, lengths, 0.92 * height, color=COLORS[index % len(COLORS)], label=label)
+        texts = [f" {length:.3g}" if math.isfinite(length) else "" for length in lengths]
+        axes.bar_label(bars, texts, fontsize=8)
+    axes.set_yticks(range(len(plot.categories)), plot.categories)
+    axes.invert_yaxis()
+    axes.legend(frameon=False, loc="lower right", fontsize=10)
+
+
+def _pyplot() -> Any:
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+    except ImportError as error:
+        raise ValueError("plots need the extra: pip install 'dnerf[benchmark]'") from error
+    return pyplot
+
+
+def _draw_series(axes: Any, series: Series, index: int) -> tuple[float, float, str, str] | None:
+    """Draw one series; where its label goes, its text and its colour."""
+    check_choice("style", series.style, STYLES)
+    points = [(x, y, k) for k, (x, y) in enumerate(zip(series.x, series.y)) if math.isfinite(x) and math.isfinite(y)]
+    if not points:
+        return None
+    xs, ys, kept = zip(*points)
+    color = "#999999" if series.style == "guide" else COLORS[index % len(COLORS)]
+    if series.style == "guide":
+        axes.plot(xs, ys, color=color, linestyle="--", linewidth=1.0, zorder=1)
+    else:
+        line = "-" if series.style == "line" else "none"
+        marker = MARKERS[index % len(MARKERS)]
+        axes.plot(xs, ys, color=color, linestyle=line, linewidth=1.8, marker=marker, markersize=5.5, zorder=3)
+    if series.low is not None and series.high is not None:
+        low, high = ([values[k] for k in kept] for values in (series.low, series.high))
+        if series.style == "line" and len(xs) > 1:
+            axes.fill_between(xs, low, high, color=color, alpha=0.15, linewidth=0, zorder=2)
+        else:
+            axes.vlines(xs, low, high, color=color, alpha=0.6, linewidth=1.5, zorder=2)
+    for x, y, k in zip(xs, ys, kept):
+        if series.notes is not None and series.notes[k]:
+            axes.annotate(
+                series.notes[k], (x, y), xytext=(4, 5), textcoords="offset points", fontsize=8, color=color
+            )  # fmt: skip
+    last = max(range(len(xs)), key=lambda i: xs[i])
+    return xs[last], ys[last], series.label, color
+
+
+def _plain_ticks(axis: Any, low: float, high: float) -> None:
+    """Numbers such as 0.5, 2 and 50 on a log axis of a few decades rather than powers of ten."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    decades = math.log10(max(high, 1e-300)) - math.log10(max(low, 1e-300))
+    if low <= 0 or decades > 4 or low < 1e-4 or high > 1e6:
+        return
+    axis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5) if decades < 2.2 else (1,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _label_ends(figure: Any, axes: Any, ends: list[tuple[float, float, str, str]]) -> None:
+    """Write each label right of the axes at the height of its line's end, pushed apart where they would overlap."""
+    if not ends:
+        return
+    figure.canvas.draw()
+    bottom, top = axes.bbox.y0, axes.bbox.y1
+    spacing = 10 * figure.dpi / 72 * 1.25
+    heights = [float(axes.transData.transform((x, y))[1]) for x, y, _, _ in ends]
+    order = sorted(range(len(ends)), key=lambda i: heights[i])
+    placed: dict[int, float] = {}
+    floor = bottom
+    for i in order:
+        placed[i] = floor = max(heights[i], floor)
+        floor += spacing
+    ceiling = top
+    for i in reversed(order):
+        placed[i] = min(placed[i], ceiling)
+        ceiling = placed[i] - spacing
+    for i, (x, y, text, color) in enumerate(ends):
+        height = (placed[i] - bottom) / (top - bottom)
+        axes.annotate(
+            text, (x, y), xycoords="data", xytext=(1.02, height), textcoords="axes fraction", color=color, fontsize=10,
+            va="center", annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.5, "shrinkA": 0, "shrinkB": 3},
+        )  # fmt: skip

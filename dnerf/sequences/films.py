@@ -1,0 +1,194 @@
+"""Sequences from the first frame to the finished files: rendered frame by frame, resumed, shared, put together."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dnerf.checks import check_choice
+from dnerf.files import write_json
+from dnerf.logs import SHEET_COLUMNS
+from dnerf.renderer import Renderer
+from dnerf.sequences.rendering import Truth, check_outputs, render_layers
+from dnerf.sequences.store import FrameStore, write_npz
+from dnerf.sequences.views import View
+from dnerf.video import contact_sheet, error_map, write_frames
+from dnerf.visualisation import flow_picture, scaled_picture, value_range
+
+FILM_FORMATS = ("mp4", "gif", "png", "npz")
+SCALE_LABELS = {"depth": "depth", "deformation": "offset"}
+
+
+@dataclass(frozen=True)
+class Share:
+    """Which frames of a sequence one of several processes renders: every `size`-th, from its rank on.
+
+    Args:
+        rank: of this process, 0 <= rank < size.
+        size: number of processes.
+
+    Raises:
+        ValueError: if the rank is out of range.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rank < self.size:
+            raise ValueError(f"rank must be in 0..{self.size - 1}, got {self.rank}")
+
+    def mine(self, index: int) -> bool:
+        """Whether this process renders a frame."""
+        return index % self.size == self.rank
+
+
+def render_frames_to(
+    store: FrameStore,
+    renderer: Renderer,
+    views: Sequence[View],
+    outputs: Sequence[str],
+    *,
+    truth: Truth | None = None,
+    chunk: int = 16384,
+    share: Share | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> int:
+    """Render the frames that the store lacks, each written as soon as it is done.
+
+    Args:
+        store: where frames go; those it holds are left alone.
+        renderer: the model.
+        views: the sequence, as many as the store's frames.
+        outputs: see `render_layers`.
+        truth: gives true pictures.
+        chunk: rays at a time.
+        share: this process's part; all frames if None.
+        on_frame: called with the index of every frame written.
+
+    Returns:
+        The number of frames rendered.
+
+    Raises:
+        ValueError: if numbers of views and frames differ.
+    """
+    check_outputs(outputs)
+    if len(views) != store.num_frames:
+        raise ValueError(f"views must be {store.num_frames} as the store's frames, got {len(views)}")
+    share = share or Share()
+    missing = [i for i in store.missing() if share.mine(i)]
+    for index in missing:
+        following = views[index + 1] if index + 1 < len(views) else None
+        store.write(index, render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk))
+        if on_frame is not None:
+            on_frame(index)
+    return len(missing)
+
+
+def write_films(
+    store: FrameStore,
+    path: Path,
+    outputs: Sequence[str],
+    formats: Sequence[str],
+    *,
+    fps: float = 30.0,
+    views: Sequence[View] = (),
+) -> list[Path]:
+    """Make the finished files of a complete store.
+
+    The output "rgb" (or the only one) gets the path itself with the format's suffix, others `<path>_<output>`; raw
+    arrays of all outputs go into one `<path>.npz` with the layers (F, ...), times (F,), poses (F, 4, 4) and intrinsics
+    (F, 6: width, height, focal_x, focal_y, center_x, center_y in pixels).
+
+    Depth and deformation share one scale over all frames, over which 0.5 % of the opaque pixels of a frame lie outside
+    at either end; the motion wheel's length is that of the 99.5 % quantile.
+
+    Args:
+        store: all frames.
+        path: without suffix.
+        outputs: as rendered.
+        formats: some of mp4, gif, png, npz.
+        fps: frames per second.
+        views: the sequence, for the NPZ file.
+
+    Returns:
+        The paths written.
+    """
+    check_outputs(outputs)
+    for format in formats:
+        check_choice("format", format, FILM_FORMATS)
+    written = []
+    for format in formats:
+        if format == "npz":
+            written.append(write_npz(store, path.with_name(f"{path.name}.npz"), _facts(views, fps)))
+            continue
+        for output in outputs:
+            name = path.name if output == "rgb" or len(outputs) == 1 else f"{path.name}_{output}"
+            target = path.with_name(name if format == "png" else f"{name}.{format}")
+            written.append(write_frames(_pictures(store, output), target, format, fps=fps))
+    return written
+
+
+def write_plan(store: FrameStore, views: Sequence[View], facts: dict[str, object]) -> None:
+    """Write what is being rendered beside the frames, for people."""
+    write_json(store.folder / "plan.json", {**facts, "views": [view.as_dict() for view in views]})
+
+
+def _pictures(store: FrameStore, output: str) -> Iterator[NDArray | torch.Tensor]:
+    if output == "rgb":
+        yield from (frame["rgb"] for frame in store)
+    elif output == "opacity":
+        yield from (np.repeat(frame["opacity"].clip(0, 1)[..., None], 3, axis=-1) for frame in store)
+    elif output == "compare":
+        for frame in store:
+            prediction, truth = (torch.from_numpy(frame[name]).float() / 255 for name in ("rgb", "truth"))
+            yield contact_sheet([[prediction, truth, error_map(prediction, truth)]], columns=SHEET_COLUMNS)
+    elif output == "motion":
+        longest = _longest_motion(store)
+        yield from (flow_picture(torch.from_numpy(frame["motion"]), longest) for frame in store)
+    else:
+        low, high = _scale(store, output)
+        for frame in store:
+            values, opacity = torch.from_numpy(frame[output]), torch.from_numpy(frame["opacity"])
+            yield scaled_picture(values, opacity, low, high, label=SCALE_LABELS[output])
+
+
+def _scale(store: FrameStore, layer: str) -> tuple[float, float]:
+    ranges = []
+    for frame in store:
+        opaque = torch.from_numpy(frame["opacity"]) >= 0.5
+        if bool(opaque.any()):
+            ranges.append(value_range(torch.from_numpy(frame[layer]), opaque))
+    if not ranges:
+        return 0.0, 1.0
+    low = 0.0 if layer == "deformation" else min(low for low, _ in ranges)
+    high = max(high for _, high in ranges)
+    return (low, high) if high > low else (low, low + 1.0)
+
+
+def _longest_motion(store: FrameStore) -> float:
+    longest = 0.0
+    for frame in store:
+        lengths = torch.from_numpy(frame["motion"]).norm(dim=-1)
+        known = lengths.isfinite()
+        if bool(known.any()):
+            longest = max(longest, value_range(lengths, known)[1])
+    return longest if longest > 0 else 1.0
+
+
+def _facts(views: Sequence[View], fps: float) -> dict[str, NDArray]:
+    facts: dict[str, NDArray] = {"fps": np.asarray(fps)}
+    if views:
+        facts["times"] = np.array([view.time for view in views])
+        facts["poses"] = np.stack([view.camera.pose.cpu().numpy() for view in views])
+        rows = []
+        for view in views:
+            seen = view.camera.intrinsics
+            center_x = 0.5 * seen.width if seen.center_x is None else seen.center_x
+            center_y = 0.5 * seen.height if seen.center_y is None else seen.center_y
+            rows.append([seen.width, seen.height, seen.focal_x, seen.focal_y, center_x, center_y])
+        facts["intrinsics"] = np.array(rows)
+    return facts

@@ -1,0 +1,119 @@
+"""Runs in processes of their own, and what a scene needs, with a stand-in for the training script."""
+
+import json
+import sys
+
+import pytest
+
+from dnerf.benchmarks import runs
+from dnerf.benchmarks.needs import Trial, smallest_enough
+from dnerf.benchmarks.runs import run_training
+from dnerf.benchmarks.scenes import scene_overrides
+from dnerf.benchmarks.suite import Settings
+from dnerf.benchmarks.training import run as run_training_suite
+
+SCRIPT = """
+import json, sys
+from pathlib import Path
+values = dict(word.split("=", 1) for word in sys.argv[1:])
+if values.get("fail"):
+    sys.exit("error: the reason")
+ballast = bytearray(int(values.get("mib", 0)) << 20)
+ballast[::4096] = b"x" * len(ballast[::4096])
+out = Path(values["out_dir"])
+out.mkdir(parents=True)
+seconds = float(values.get("trainer.max_seconds", 1))
+metrics = {"psnr": 20 + seconds + int(values.get("seed", 0)), "ssim": 0.5, "train_seconds": seconds, "num_steps": 10,
+           "num_parameters": 7, "seconds_per_frame": 0.25, "split": "test", "frames": []}
+(out / "metrics.json").write_text(json.dumps(metrics))
+with open(out.parent / "calls.txt", "a") as file:
+    file.write(" ".join(sys.argv[1:]) + chr(10))
+"""
+
+
+@pytest.fixture
+def command(tmp_path):
+    path = tmp_path / "train.py"
+    path.write_text(SCRIPT)
+    return [sys.executable, str(path)]
+
+
+def test_memory_is_that_of_this_child_alone(command, tmp_path):
+    large = run_training(command, ["mib=200"], tmp_path / "large")
+    small = run_training(command, ["mib=0"], tmp_path / "small")
+    # The ballast, to the few MiB that interpreters differ by.
+    assert large.peak_mib - small.peak_mib == pytest.approx(200, abs=10)
+    assert small.psnr == 21
+    assert small.step_ms == 100
+
+
+def test_a_run_of_the_same_clean_commit_is_not_repeated(command, tmp_path, monkeypatch):
+    for commit, expected in (("abc", 1), ("abc", 1), ("def", 2), ("def + changes", 3), ("def + changes", 4)):
+        monkeypatch.setattr(runs, "describe_machine", lambda commit=commit: {"commit": commit})
+        assert run_training(command, ["seed=2"], tmp_path / "run").psnr == 23
+        assert len((tmp_path / "calls.txt").read_text().splitlines()) == expected
+
+
+def test_a_failed_run_is_told_with_its_reason(command, tmp_path):
+    with pytest.raises(ValueError, match=r"failed with exit code 1: error: the reason \(log: .*x.log\)"):
+        run_training(command, ["fail=1"], tmp_path / "x")
+
+
+def test_training_suite_averages_over_seeds(command, tmp_path):
+    options = {
+        "scenes": ["walker", "static"], "experiments": ["fast", "dnerf"], "seconds": [4, 8], "seeds": [0, 2],
+        "resolution": 50, "frames": {"dnerf": 2}, "splits": {"static": "val"}, "data_root": None,
+    }  # fmt: skip
+    result = run_training_suite(Settings(work_dir=tmp_path / "work", train_command=command, options=options))
+    means = result.tables[0].rows
+    assert len(means) == 8
+    row = next(r for r in means if (r["scene"], r["experiment"], r["budget_s"]) == ("static", "dnerf", 8))
+    assert (row["psnr"], row["psnr_low"], row["psnr_high"], row["split"], row["frames"]) == (29, 28, 30, "val", 2)
+    assert [p.name for p in result.plots] == ["training_walker", "training_static"]
+    calls = (tmp_path / "work" / "calls.txt").read_text().splitlines()
+    assert len(calls) == 16
+    wanted = ("experiment=dnerf", "scene=static", "data.resolution=50", "evaluate_split=val", "evaluate_frames=2")
+    assert all(word in calls[-1].split() for word in wanted)
+
+
+def trial(psnr):
+    return Trial(psnr, 0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("together", "removed"),
+    [({"without b, a": 29.95}, ["b", "a"]), ({"without b, a": 29.0}, ["a"])],
+)
+def test_parts_that_are_missed_together_are_put_back_the_most_valuable_first(together, removed):
+    without = {"a": trial(30.0), "b": trial(29.95), "c": trial(25.0)}
+    parts = {name: [f"part={name}"] for name in without}
+    tried = []
+
+    def train(name, overrides):
+        tried.append((name, list(overrides)))
+        return trial(together[name])
+
+    names, smallest = smallest_enough(trial(29.92), without, parts, train, 29.9)
+    assert names == removed
+    assert smallest.psnr >= 29.9
+    assert tried == [("without b, a", ["part=b", "part=a"])]
+
+
+def test_all_parts_stay_if_each_is_missed():
+    without = {"a": trial(20.0)}
+    full = trial(30.0)
+    assert smallest_enough(full, without, {"a": []}, lambda name, overrides: full, 29.9) == ([], full)
+
+
+def test_scenes_are_exact_ones_or_folders(tmp_path):
+    assert scene_overrides("walker", 80, None) == ["data=synthetic", "scene=walker", "data.resolution=80"]
+    (tmp_path / "lego").mkdir()
+    assert f"data.root={tmp_path / 'lego'}" in scene_overrides("lego", 80, str(tmp_path))
+    with pytest.raises(ValueError, match="or a folder below data_root"):
+        scene_overrides("lego", 80, None)
+
+
+def test_memory_table_is_written_as_json(command, tmp_path):
+    run_training(command, [], tmp_path / "run")
+    saved = json.loads((tmp_path / "run" / runs.KEPT).read_text())
+    assert saved["run"]["num_parameters"] == 7

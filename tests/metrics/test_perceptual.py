@@ -1,0 +1,49 @@
+"""LPIPS is an extra whose absence is explained; with its library and weights at hand it is a distance."""
+
+import builtins
+from pathlib import Path
+
+import pytest
+import torch
+
+from dnerf.metrics.perceptual import BACKBONES, lpips_metric
+
+
+def test_a_missing_extra_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def without_torchvision(name: str, *arguments: object, **options: object) -> object:
+        if name == "torchvision":
+            raise ImportError("No module named 'torchvision'")
+        return real(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without_torchvision)
+    with pytest.raises(ValueError, match=r"lpips needs the extra: pip install 'dnerf\[lpips\]'"):
+        lpips_metric()
+
+
+def test_missing_weights_are_explained_and_never_fetched(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pytest.importorskip("torchvision", reason="needs the extra: pip install 'dnerf[lpips]'")
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_: pytest.fail("it went to the network"))
+    with pytest.raises(ValueError, match=rf"put {BACKBONES['alex']} into .* or allow the download with lpips.download"):
+        lpips_metric()
+
+
+def test_an_unknown_backbone_is_named() -> None:
+    with pytest.raises(ValueError, match="backbone must be one of alex, vgg; got 'squeeze'"):
+        lpips_metric("squeeze")
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_lpips_is_a_distance(backbone: str) -> None:
+    pytest.importorskip("torchvision", reason="needs the extra: pip install 'dnerf[lpips]'")
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[backbone]
+    if not weights.is_file():
+        pytest.skip(f"the weights are not at hand: {weights}")
+    distance = lpips_metric(backbone)
+    picture = torch.rand(64, 64, 3)
+    assert distance(picture, picture) == pytest.approx(0, abs=1e-6)
+    near, far = distance((picture + 0.02).clamp(0, 1), picture), distance(torch.rand(64, 64, 3), picture)
+    assert 0 < near < far
+    assert distance(picture + 5, torch.ones(64, 64, 3)) == pytest.approx(0, abs=1e-5)  # clamped

@@ -1,0 +1,240 @@
+"""render.py, evaluate.py and report.py as a user runs them: killed and begun again, shared, by protocol, as a page."""
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+from test_scripts import ROOT, TINY, run_script
+
+from dnerf.data import load_blender
+from dnerf.metrics import psnr
+from dnerf.protocols import PROTOCOLS, Protocol
+
+KEYS = {"keyframes": [{"seconds": 0, "time": 0.1, "azimuth": 0}, {"seconds": 0.5, "time": 0.6, "azimuth": 40}]}
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """A folder with a run of a blender scene called lego, 16 x 16 pictures with alpha."""
+    cwd = tmp_path_factory.mktemp("sequences")
+    made = run_script(
+        "make_dataset", "scene=walker", "num_frames=3", "num_val=1", "num_test=2", "resolution=24", "out=data/lego",
+        cwd=cwd,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    done = run_script(
+        "train", "experiment=fast", "data=blender", "data.root=data/lego", "data.resolution=24", *TINY[4:],
+        "out_dir=run", "seed=3", cwd=cwd,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return cwd
+
+
+@pytest.fixture(autouse=True)
+def in_the_work_folder(work, monkeypatch):
+    monkeypatch.chdir(work)
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+
+
+def call(script: str, *overrides: str) -> None:
+    """A script's own work on a composed config, without the seconds that a process of its own takes to start."""
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        config = compose(script, list(overrides))
+    importlib.import_module(script).main(config)
+
+
+def films(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+
+
+def test_a_killed_rendering_goes_on_and_gives_the_same_bytes(work, capsys):
+    arguments = ("run=run", "path=orbit", "num_frames=40", "fps=10", "format=[mp4,npz]", "outputs=[rgb,depth]")
+    call("render", *arguments, "output=whole/film")
+    command = [sys.executable, str(ROOT / "scripts" / "render.py"), *arguments, "output=killed/film"]
+    with subprocess.Popen(command, cwd=work, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 120
+        while len(list((work / "killed").glob(".film.*/frame_*.npz"))) < 4:
+            assert process.poll() is None, "it was over before it could be killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+    finished = list((work / "killed").glob(".film.*/frame_*.npz"))
+    assert 4 <= len(finished) < 40
+    assert not (work / "killed" / "film.mp4").exists()
+    before = {path: path.stat().st_mtime_ns for path in finished}
+    call("render", *arguments, "output=killed/film", "keep_frames=true")
+    assert f"{len(finished)} of 40 frames are there already" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in finished} == before
+    assert films(work / "killed") == films(work / "whole")
+    assert not list((work / "whole").glob(".film.*")), "finished frames are removed"
+
+
+@pytest.mark.slow
+def test_torchrun_shares_a_sequence_and_gives_the_same_bytes(work):
+    arguments = ("run=run", "path=spiral", "num_frames=5", "format=[png,gif]", "fps=10", "outputs=[rgb,opacity,motion]")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    for name, launcher in (("one", []), ("two", ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"])):
+        command = [sys.executable, *launcher, str(ROOT / "scripts" / "render.py"), *arguments, f"output={name}/film"]
+        done = subprocess.run(
+            command, cwd=work, capture_output=True, text=True, timeout=300, check=False, env=environment
+        )
+        assert done.returncode == 0, done.stderr
+    one, two = (
+        {str(p.relative_to(f)): p.read_bytes() for p in f.rglob("*.*") if p.is_file()}
+        for f in (work / "one", work / "two")
+    )
+    assert len(one) == 3 + 3 * 5
+    assert one == two
+
+
+def test_key_frames_make_a_film_at_their_own_pace(work):
+    (work / "keys.json").write_text(json.dumps(KEYS))
+    call(
+        "render",
+        "run=run",
+        "path=keyframes",
+        "path.file=keys.json",
+        "fps=10",
+        "resolution=[32,20]",
+        "format=[mp4,npz]",
+        "output=keys/film",
+    )
+    assert iio.imread(work / "keys" / "film.mp4").shape == (6, 20, 32, 3)
+    with np.load(work / "keys" / "film.npz") as arrays:
+        assert arrays["times"][[0, -1]] == pytest.approx([0.1, 0.6])
+        assert arrays["intrinsics"][0, 2] == pytest.approx(arrays["intrinsics"][0, 3]), "pixels stay square"
+
+
+def test_outputs_and_slow_motion(work):
+    call(
+        "render",
+        "run=run",
+        "path=fixed",
+        "time=slow",
+        "time_range=[0.2,0.8]",
+        "num_frames=5",
+        "format=npz",
+        "outputs=[deformation,motion]",
+        "output=slow/film.npz",
+    )
+    with np.load(work / "slow" / "film.npz") as arrays:
+        steps = np.diff(arrays["times"])
+        assert arrays["times"][[0, -1]] == pytest.approx([0.2, 0.8])
+        assert steps[1] < 0.7 * steps[0]
+        assert arrays["motion"].shape == (5, 24, 24, 2)
+        assert np.isnan(arrays["motion"][-1]).all()
+        assert arrays["deformation"].shape == (5, 24, 24)
+
+
+def test_truth_stands_beside_the_prediction(work):
+    call(
+        "render",
+        "run=run",
+        "path=test",
+        "format=png",
+        "outputs=[compare]",
+        "output=compare/film",
+    )
+    assert len(list((work / "compare" / "film").glob("*.png"))) == 2
+
+
+def test_evaluation_by_protocol_says_everything_and_makes_tables(work):
+    call(
+        "evaluate",
+        "runs=[run,run]",
+        "lego_split=val",
+        "table=tables/t",
+        "worst=1",
+        "label=tiny",
+        "temporal.enabled=true",
+        "temporal.num_frames=3",
+        "temporal.resolution=16",
+    )
+    metrics = json.loads((work / "run" / "metrics.json").read_text())
+    assert metrics.keys() >= {
+        "protocol", "seed", "train_seconds", "hardware", "commit", "train_hardware", "train_commit", "resolution",
+        "background", "scene", "split", "method",
+    }  # fmt: skip
+    assert (metrics["scene"], metrics["split"], metrics["seed"], metrics["background"]) == ("lego", "val", 3, "white")
+    temporal = json.loads((work / "run" / "temporal.json").read_text())
+    assert temporal["motion"] == "model"
+    assert "track_error" not in temporal
+    rows = json.loads((work / "tables" / "t.json").read_text())
+    assert [row["method"] for row in rows] == ["tiny", "tiny"]
+    table = (work / "tables" / "t.md").read_text()
+    assert f"| tiny | lego | val | {metrics['psnr']:.2f} |" in table
+    assert (work / "tables" / "t.csv").read_text().count("\n") == 3
+    assert (work / "tables" / "t.svg").read_text().startswith("<svg")
+    assert (work / "run" / "worst_frames_val.png").exists()
+
+
+def test_a_protocol_sets_resolution_background_and_split(work, monkeypatch):
+    monkeypatch.setitem(PROTOCOLS, "tiny", Protocol("tiny", 16, "black"))
+    call("evaluate", "run=run", "protocol=tiny", "worst=0", "plots=false")
+    path = work / "run" / "metrics_tiny_test.json"
+    metrics = json.loads(path.read_text())
+    path.unlink()  # a report would put it first
+    assert (metrics["protocol"], metrics["resolution"], metrics["background"]) == ("tiny", 16, "black")
+    hydra_app = importlib.import_module("hydra_app")
+    renderer = hydra_app.load_renderer("run", hydra_app.load_config("run"), torch.device("cpu"))
+    frames = load_blender("data/lego", "test", 16)
+    for index, scored in enumerate(metrics["frames"]):
+        image = renderer.render_image(frames.camera(index), float(frames.times[index]))
+        # The model's own background is white: black is what opacity leaves of it.
+        on_black = image.rgb - (1 - image.opacity[..., None])
+        assert scored["psnr"] == pytest.approx(psnr(on_black, frames.image(index, (0.0, 0.0, 0.0))), abs=1e-3)
+
+
+def test_pictures_are_never_enlarged_to_fit_a_protocol(work):
+    with pytest.raises(ValueError, match="800"):
+        call("evaluate", "run=run", "protocol=gs")
+
+
+def test_report_is_made_from_what_lies_in_the_run(work):
+    call("evaluate", "run=run")
+    call("render", "run=run", "num_frames=4", "fps=10")
+    done = run_script("report", "run=run", cwd=work)
+    assert done.returncode == 0, done.stderr
+    text = (work / "run" / "report.html").read_text()
+    metrics = json.loads((work / "run" / "metrics.json").read_text())
+    for value in (f"{metrics['psnr']:.2f} dB", metrics["commit"], "data:video/mp4", "Worst frames", "num_slabs: 16"):
+        assert value in text
+
+
+WRONG = [
+    ("render", ("run=run", "outputs=[sound]"), "outputs"),
+    ("render", ("run=run", "outputs=[]"), "outputs"),
+    ("render", ("run=run", "outputs=[compare]"), "compare"),
+    ("render", ("run=run", "format=[mp4,avi]"), "format"),
+    ("render", ("run=run", "time=backwards"), "time"),
+    ("render", ("run=run", "time_range=[0.5,2]"), "end"),
+    ("render", ("run=run", "time=slow", "slow_motion.factor=0"), "factor"),
+    ("render", ("run=run", "resolution=[20]"), "resolution"),
+    ("render", ("run=run", "path=keyframes"), "file"),
+    ("render", ("run=run", "path=keyframes", "path.file=nowhere.json"), "nowhere.json"),
+    ("evaluate", ("run=run", "protocol=nerf"), "protocol"),
+    ("evaluate", ("run=run", "lego_split=other"), "lego_split"),
+    ("evaluate", ("run=run", "runs=[run]"), "run"),
+    ("evaluate", ("runs=[run,nowhere]",), "nowhere"),
+    ("evaluate", ("run=run", "lpips.enabled=true"), "lpips"),
+    ("report", ("run=nowhere",), "nowhere"),
+    ("report", ("run=run", "films=[nowhere.mp4]"), "nowhere.mp4"),
+]
+
+
+@pytest.mark.parametrize(("script", "arguments", "named"), WRONG)
+def test_wrong_input_is_named(work, script, arguments, named):
+    with pytest.raises((ValueError, OSError, HydraException, OmegaConfBaseException), match=named):
+        call(script, *arguments)

@@ -1,0 +1,88 @@
+import csv
+import io
+
+import pytest
+
+from dnerf.protocols import (
+    DNERF_SCENES,
+    PROTOCOLS,
+    csv_table,
+    find_protocol,
+    markdown_table,
+    missing_scenes,
+    scene_means,
+)
+
+
+def row(scene: str, psnr: float, **others: object) -> dict:
+    return {"method": "fast", "protocol": "dnerf", "scene": scene, "split": "test", "psnr": psnr, "ssim": 0.9, **others}
+
+
+# T-NeRF with occupancy as nerfacc published it, whose eight-scene mean is 32.22.
+PUBLISHED = dict(zip(DNERF_SCENES, (39.49, 25.58, 31.86, 32.73, 24.32, 35.55, 35.90, 32.33)))
+
+
+def test_protocols_are_those_that_papers_use() -> None:
+    assert (PROTOCOLS["dnerf"].resolution, PROTOCOLS["dnerf"].background, PROTOCOLS["dnerf"].split) == (
+        400,
+        "white",
+        "test",
+    )
+    assert (PROTOCOLS["gs"].resolution, PROTOCOLS["gs"].background) == (800, "black")
+    with pytest.raises(ValueError, match="protocol must be one of dnerf, gs; got 'nerf'"):
+        find_protocol("nerf")
+
+
+def test_means_of_a_published_table_come_out() -> None:
+    means = {mean["scene"]: mean for mean in scene_means([row(s, p) for s, p in PUBLISHED.items()])}
+    assert means.keys() == {"mean of 8 (lego: test)", "mean of 7 (without lego)"}
+    assert means["mean of 8 (lego: test)"]["psnr"] == pytest.approx(32.22, abs=0.005)
+    without = sum(p for s, p in PUBLISHED.items() if s != "lego") / 7
+    assert means["mean of 7 (without lego)"]["psnr"] == pytest.approx(without)
+
+
+def test_the_mean_says_which_split_lego_used() -> None:
+    rows = [row(s, p, **({"split": "val"} if s == "lego" else {})) for s, p in PUBLISHED.items()]
+    assert scene_means(rows)[0]["scene"] == "mean of 8 (lego: val)"
+
+
+def test_seven_scenes_have_their_mean_and_other_sets_are_named() -> None:
+    seven = [row(s, p) for s, p in PUBLISHED.items() if s != "lego"]
+    assert [mean["scene"] for mean in scene_means(seven)] == ["mean of 7 (without lego)"]
+    two = [row("mutant", 30.0), row("trex", 32.0)]
+    (mean,) = scene_means(two)
+    assert mean["scene"] == "mean of 2 (mutant, trex)"
+    assert mean["psnr"] == 31
+    assert scene_means([row("mutant", 30.0)]) == []
+    assert "lego" in missing_scenes(two)
+    assert missing_scenes([row(s, 1.0) for s in DNERF_SCENES]) == []
+
+
+def test_seeds_are_averaged_within_a_scene_first() -> None:
+    rows = [row("mutant", 30.0, seed=0), row("mutant", 32.0, seed=1), row("trex", 40.0)]
+    assert scene_means(rows)[0]["psnr"] == pytest.approx((31 + 40) / 2)
+
+
+def test_methods_and_protocols_are_never_mixed() -> None:
+    rows = [row("mutant", 30.0), row("trex", 32.0), {**row("mutant", 50.0), "protocol": "gs"},
+            {**row("trex", 52.0), "protocol": "gs"}, {**row("mutant", 10.0), "method": "slow"}]  # fmt: skip
+    means = {(mean["method"], mean["protocol"]): mean["psnr"] for mean in scene_means(rows)}
+    assert means == {("fast", "dnerf"): 31, ("fast", "gs"): 51}
+
+
+def test_a_column_that_some_rows_lack_has_no_mean() -> None:
+    mean = scene_means([row("mutant", 30.0, lpips=0.1), row("trex", 32.0)])[0]
+    assert "lpips" not in mean
+    assert "lpips" in scene_means([row("mutant", 30.0, lpips=0.1), row("trex", 32.0, lpips=0.3)])[0]
+
+
+def test_tables_hold_every_row_and_column() -> None:
+    rows = [row("mutant", 30.123456, seed=3, train_seconds=60.4, hardware="2 x A | B"), row("trex", 32.0, seed=3)]
+    lines = markdown_table(rows).splitlines()
+    assert len(lines) == 5
+    assert lines[0] == "| method | scene | split | PSNR | SSIM | protocol | seed | train s | scored on |"
+    assert lines[2] == "| fast | mutant | test | 30.12 | 0.9000 | dnerf | 3 | 60 | 2 x A \\| B |"
+    assert "mean of 2 (mutant, trex)" in lines[4]
+    table = list(csv.DictReader(io.StringIO(csv_table(rows))))
+    assert [float(line["psnr"]) for line in table] == pytest.approx([30.123456, 32.0, 31.061728])
+    assert table[0]["hardware"] == "2 x A | B"
