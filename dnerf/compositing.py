@@ -18,6 +18,9 @@ from dnerf.checks import check_shape
 from dnerf.kernels import packed_sum, packed_weights
 from dnerf.rays import Samples
 
+FAINT = 1e-30
+"""Opacity up to which depth has no gradient: quotients by numbers near the smallest float32 have infinite ones."""
+
 
 @dataclass(frozen=True)
 class FieldOutput:
@@ -115,9 +118,13 @@ def sum_along_rays(values: Tensor, samples: Samples, weights: Tensor | None = No
     return values.sum(dim=1)
 
 
-def safe_divide(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """Quotient that is 0, with zero gradient, where the denominator is 0."""
+def safe_divide(numerator: Tensor, denominator: Tensor, faint: float = 0.0) -> Tensor:
+    """Quotient that is 0 where the denominator is 0, and has no gradient where that is at most `faint` (>= 0)."""
     zero = denominator == 0
+    if faint:
+        is_faint = denominator <= faint
+        numerator = torch.where(is_faint, numerator.detach(), numerator)
+        denominator = torch.where(is_faint, denominator.detach(), denominator)
     return torch.where(zero, torch.zeros_like(numerator), numerator / torch.where(zero, 1.0, denominator))
 
 
@@ -156,7 +163,7 @@ def composite(samples: Samples, output: FieldOutput, background: Tensor | None =
     return Rendering(
         rgb=rgb,
         opacity=opacity,
-        depth=safe_divide(depth, opacity),
+        depth=safe_divide(depth, opacity, FAINT),
         background=background,
         weights=weights,
         samples=samples,
