@@ -10,6 +10,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.compositing import Rendering, composite
 from dnerf.fields.base import RadianceField
+from dnerf.quadrature import check_rule
 from dnerf.rays import Rays
 from dnerf.samplers.base import Sampler
 
@@ -23,11 +24,12 @@ class Renderer(nn.Module):
         field: what is rendered.
         sampler: where along rays it is evaluated.
         background: what lies behind; white if None.
+        quadrature: how density between samples is read, "constant", "linear" or "parabolic": see `dnerf.quadrature`.
         precision: "float32", or "bfloat16" to run networks under autocast; positions, encodings and compositing stay
             float32 either way.
 
     Raises:
-        ValueError: for another precision.
+        ValueError: for another precision or quadrature.
     """
 
     def __init__(
@@ -37,13 +39,16 @@ class Renderer(nn.Module):
         background: Background | None = None,
         *,
         precision: str = "float32",
+        quadrature: str = "constant",
     ) -> None:
         super().__init__()
+        check_rule(quadrature)
         check_choice("precision", precision, tuple(PRECISIONS))
         self.field = field
         self.sampler = sampler
         self.background = ConstantBackground("white") if background is None else background
         self.precision = precision
+        self.quadrature = quadrature
 
     @property
     def device(self) -> torch.device:
@@ -64,10 +69,12 @@ class Renderer(nn.Module):
         if self.training:
             self.sampler.observe(positions.detach(), times, output.density.detach())
         background = self.background(rays.directions, generator=generator)
-        rendering = composite(samples, output, background)
+        rendering = composite(samples, output, background, quadrature=self.quadrature)
         if not samples.proposals:
             return rendering
-        proposals = tuple(composite(placed, said, background) for placed, said in samples.proposals)
+        proposals = tuple(
+            composite(placed, said, background, quadrature=self.quadrature) for placed, said in samples.proposals
+        )
         return Rendering(**{**vars(rendering), "proposals": proposals})
 
     def update(self, step: int) -> None:

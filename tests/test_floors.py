@@ -22,6 +22,7 @@ FLOORS = {
     "cameras": 1,
     "compositing": 1,
     "kernels": 1,
+    "quadrature": 1,
     "deformations": 2,
     "fields": 3,
     "samplers": 4,
@@ -47,6 +48,7 @@ FLOORS = {
 # logs record what training, evaluation and video make.
 WITHIN_A_FLOOR = {
     ("compositing", "kernels"),
+    ("compositing", "quadrature"),
     ("encodings", "checks"),
     ("encodings", "geometry"),
     ("geometry", "checks"),

@@ -9,7 +9,7 @@ from torch import nn
 
 from dnerf.backgrounds import ConstantBackground, RandomBackground
 from dnerf.cameras import Camera, Intrinsics, look_at
-from dnerf.compositing import Rendering
+from dnerf.compositing import Rendering, composite
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, NeRFField, RadianceField
 from dnerf.renderer import Renderer
@@ -230,3 +230,17 @@ def test_all_empty_rays_show_the_background(sampler: str) -> None:
 def test_renderer_without_rays_gives_no_pixels() -> None:
     renderer: nn.Module = Renderer(trained_field(), ImportanceSampler(4, 4))
     assert renderer(rays_towards_origin(3)[:0]).rgb.shape == (0, 3)
+
+
+def test_quadrature_is_that_of_the_compositor() -> None:
+    rays = rays_towards_origin(50)
+    pictures = {}
+    for rule in ("constant", "linear", "parabolic"):
+        renderer = Renderer(soft_ball(), StratifiedSampler(12), quadrature=rule).eval()
+        samples = renderer.sampler(rays, renderer.field)
+        pictures[rule] = renderer(rays).rgb
+        expected = composite(samples, renderer.field(*samples.locate(rays)), torch.ones(3), quadrature=rule).rgb
+        assert torch.equal(pictures[rule], expected)
+    assert (pictures["constant"] - pictures["parabolic"]).abs().max() > 1e-4
+    with pytest.raises(ValueError, match="quadrature must be one of"):
+        Renderer(soft_ball(), StratifiedSampler(12), quadrature="cubic")
