@@ -61,6 +61,9 @@ def _draw_bars(axes: Any, plot: BarPlot) -> None:
         axes.bar_label(bars, texts, fontsize=8)
     axes.set_yticks(range(len(plot.categories)), plot.categories)
     axes.invert_yaxis()
+    if plot.log:
+        axes.set_xscale("log")
+    axes.margins(x=0.12)
     axes.legend(frameon=False, loc="lower right", fontsize=10)
 
 

@@ -90,7 +90,7 @@ def methods(field: RadianceField, quick: bool = False) -> dict[str, Method]:
         "importance": importance("constant", "constant"),
         "importance, linear": importance("linear", "linear"),
     }
-    box = field.box.tolist()  # type: ignore[union-attr,operator]
+    box = field.box.tolist()  # type: ignore[operator]
     guide = OccupancySampler(box, 1.0, 16 if quick else 40, num_slabs=4 if quick else 16, threshold=1e-3, pad_to=1)
     guide.eval().fill(field, 2 if quick else 4)
 

@@ -1,5 +1,7 @@
 """Hierarchical importance sampling: a coarse pass tells where the fine samples go."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -54,22 +56,19 @@ class ImportanceSampler(Sampler):
         coarse = self.coarse(rays, field, generator=generator)
         density, proposals = self._coarse_pass(rays, coarse, field)
         edges = torch.cat([coarse.starts, coarse.ends[:, -1:]], dim=-1)
+        random: dict[str, Any] = {"randomized": self.training, "generator": generator}
         if self.quadrature == "linear":
             # Density is held from the ray's ends to the first and last sample.
             points = torch.cat([edges[:, :1], coarse.distances, edges[:, -1:]], dim=-1)
             held = torch.cat([density[:, :1], density, density[:, -1:]], dim=-1)
-            drawn = sample_piecewise_linear(
-                points, held, self.num_fine, randomized=self.training, generator=generator
-            )  # fmt: skip
+            drawn = sample_piecewise_linear(points, held, self.num_fine, **random)
         else:
             weights = render_weights(density.detach() * coarse.lengths, coarse)
-            drawn = sample_piecewise_constant(
-                edges, weights, self.num_fine, randomized=self.training, generator=generator
-            )  # fmt: skip
+            drawn = sample_piecewise_constant(edges, weights, self.num_fine, **random)
         merged = torch.cat([edges, drawn], dim=-1).sort(dim=-1).values
         starts, ends = merged[:, :-1], merged[:, 1:]
-        points = random_points(starts, ends, generator) if self.training else None
-        return Samples(starts, ends, len(rays), points=points, proposals=proposals)
+        within = random_points(starts, ends, generator) if self.training else None
+        return Samples(starts, ends, len(rays), points=within, proposals=proposals)
 
     def _coarse_pass(
         self, rays: Rays, coarse: Samples, field: RadianceField
