@@ -17,7 +17,7 @@ from dnerf.kernels import skip_distances
 from dnerf.rays import Rays
 from dnerf.samplers import OccupancySampler
 
-KNOBS = {
+KNOBS: dict[str, tuple[str, list[float]]] = {
     "occupancy_resolution": ("occupancy cells along a side", [32, 64, 128, 256]),
     "grid_resolution": ("finest feature grid's cells along a side", [32, 64, 128, 256, 512]),
     "rays": ("rays in the batch", [1024, 4096, 16384, 65536]),
@@ -162,8 +162,8 @@ def _plot(knob: str, rows: list[dict[str, Any]], name: str, y_label: str, column
     series = []
     for label, column in columns.items():
         low, high = (column.replace("_ms", f"_{end}_ms") for end in ("low", "high"))
-        spread = {} if low not in part[0] else {"low": [r[low] for r in part], "high": [r[high] for r in part]}
-        series.append(Series(label, x, [row[column] for row in part], **spread))
+        spread = [None if end not in part[0] else [row[end] for row in part] for end in (low, high)]
+        series.append(Series(label, x, [row[column] for row in part], *spread))
     if name == "time":
         scale = part[0]["forward_ms"] / max(part[0]["samples"], 1)
         series.append(
