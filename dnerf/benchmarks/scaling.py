@@ -162,8 +162,8 @@ def _plot(knob: str, rows: list[dict[str, Any]], name: str, y_label: str, column
     series = []
     for label, column in columns.items():
         low, high = (column.replace("_ms", f"_{end}_ms") for end in ("low", "high"))
-        spread = [None if end not in part[0] else [row[end] for row in part] for end in (low, high)]
-        series.append(Series(label, x, [row[column] for row in part], *spread))
+        ends = [None if end not in part[0] else [row[end] for row in part] for end in (low, high)]
+        series.append(Series(label, x, [row[column] for row in part], ends[0], ends[1]))
     if name == "time":
         scale = part[0]["forward_ms"] / max(part[0]["samples"], 1)
         series.append(
