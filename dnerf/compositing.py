@@ -16,7 +16,11 @@ from torch import Tensor
 
 from dnerf.checks import check_shape
 from dnerf.kernels import packed_sum, packed_weights
+from dnerf.quadrature import optical_depths, spread_weights
 from dnerf.rays import Samples
+
+FAINT = 1e-30
+"""Opacity up to which depth has no gradient: quotients by numbers near the smallest float32 have infinite ones."""
 
 
 @dataclass(frozen=True)
@@ -115,29 +119,39 @@ def sum_along_rays(values: Tensor, samples: Samples, weights: Tensor | None = No
     return values.sum(dim=1)
 
 
-def safe_divide(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """Quotient that is 0, with zero gradient, where the denominator is 0."""
+def safe_divide(numerator: Tensor, denominator: Tensor, faint: float = 0.0) -> Tensor:
+    """Quotient that is 0 where the denominator is 0, and has no gradient where that is at most `faint` (>= 0)."""
     zero = denominator == 0
+    if faint:
+        is_faint = denominator <= faint
+        numerator = torch.where(is_faint, numerator.detach(), numerator)
+        denominator = torch.where(is_faint, denominator.detach(), denominator)
     return torch.where(zero, torch.zeros_like(numerator), numerator / torch.where(zero, 1.0, denominator))
 
 
-def composite(samples: Samples, output: FieldOutput, background: Tensor | None = None) -> Rendering:
+def composite(
+    samples: Samples, output: FieldOutput, background: Tensor | None = None, *, quadrature: str = "constant"
+) -> Rendering:
     """Composite a field's output along rays into colour, opacity and expected depth.
 
     Args:
         samples: dense or packed intervals of R rays.
         output: the field at the samples' points, laid out like them.
         background: (R, 3) or (3,) colour behind the rays; None is black.
+        quadrature: how density between samples is read: "constant", "linear" or "parabolic", see `dnerf.quadrature`.
 
     Returns:
         A `Rendering`; rays without samples show the background.
 
     Raises:
-        ValueError: if shapes do not fit.
+        ValueError: if shapes do not fit, or for another rule.
     """
     check_shape("density", output.density, samples.starts.shape)
     check_shape("rgb", output.rgb, (*samples.starts.shape, 3))
-    weights = render_weights(_at_least_float32(output.density) * samples.lengths, samples)
+    depths, shares = optical_depths(_at_least_float32(output.density), samples, quadrature)
+    weights = render_weights(depths, samples)
+    if shares is not None:
+        weights = spread_weights(weights, shares, samples)
     columns = torch.cat(
         [
             _at_least_float32(output.rgb).to(weights.dtype),
@@ -156,7 +170,7 @@ def composite(samples: Samples, output: FieldOutput, background: Tensor | None =
     return Rendering(
         rgb=rgb,
         opacity=opacity,
-        depth=safe_divide(depth, opacity),
+        depth=safe_divide(depth, opacity, FAINT),
         background=background,
         weights=weights,
         samples=samples,

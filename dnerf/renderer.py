@@ -10,6 +10,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.compositing import Rendering, composite, safe_divide
 from dnerf.fields.base import RadianceField
+from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 from dnerf.samplers.visibility import walk_front_to_back
@@ -25,13 +26,15 @@ class Renderer(nn.Module):
         field: what is rendered.
         sampler: where along rays it is evaluated.
         background: what lies behind; white if None.
+        quadrature: how density between samples is read, "constant", "linear" or "parabolic": see `dnerf.quadrature`.
         precision: "float32", or "bfloat16" to run networks under autocast; positions, encodings and compositing stay
             float32 either way.
         stop_transmittance: whole images end a ray of packed samples once so little light is left, which changes
-            colours by at most as much; 0 to ask the field everywhere.
+            colours by at most as much; 0 to ask the field everywhere. Without effect on other quadratures than the
+            constant one, whose intervals do not depend on their neighbours.
 
     Raises:
-        ValueError: for another precision, or a transmittance outside [0, 1).
+        ValueError: for another precision or quadrature, or a transmittance outside [0, 1).
     """
 
     def __init__(
@@ -42,16 +45,19 @@ class Renderer(nn.Module):
         *,
         precision: str = "float32",
         stop_transmittance: float = 0.0,
+        quadrature: str = "constant",
     ) -> None:
         super().__init__()
         if not 0 <= stop_transmittance < 1:
             raise ValueError(f"stop_transmittance must be in [0, 1), got {stop_transmittance}")
+        check_rule(quadrature)
         check_choice("precision", precision, tuple(PRECISIONS))
         self.field = field
         self.sampler = sampler
         self.background = ConstantBackground("white") if background is None else background
         self.precision = precision
         self.stop_transmittance = stop_transmittance
+        self.quadrature = quadrature
 
     @property
     def device(self) -> torch.device:
@@ -76,17 +82,19 @@ class Renderer(nn.Module):
         if self.training:
             self.sampler.observe(positions.detach(), times, output.density.detach())
         background = self.background(rays.directions, generator=generator)
-        rendering = composite(samples, output, background)
+        rendering = composite(samples, output, background, quadrature=self.quadrature)
         if not samples.proposals:
             return rendering
-        proposals = tuple(composite(placed, said, background) for placed, said in samples.proposals)
+        proposals = tuple(
+            composite(placed, said, background, quadrature=self.quadrature) for placed, said in samples.proposals
+        )
         return Rendering(**{**vars(rendering), "proposals": proposals})
 
     def _without_gradients(self, rays: Rays) -> Rendering:
         """What `forward` shows, without per-sample data: rays end where they are opaque."""
         with self._autocast(rays.origins.device):
             samples = self.sampler(rays, self.field)
-        if not samples.is_packed or self.stop_transmittance == 0:
+        if not samples.is_packed or self.stop_transmittance == 0 or self.quadrature != "constant":
             return self._render(rays, samples, None)
         sums = rays.origins.new_zeros(len(rays), 5)
 

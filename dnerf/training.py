@@ -14,6 +14,7 @@ from dnerf.backgrounds import RandomBackground
 from dnerf.checks import check_choice, check_positive
 from dnerf.data.frames import Frames, composite_on
 from dnerf.losses import Loss, PhotometricLoss
+from dnerf.recovery import Recovery
 from dnerf.renderer import Renderer
 
 logger = logging.getLogger(__name__)
@@ -71,6 +72,7 @@ class Trainer:
         losses: terms by name; the photometric loss if None.
         log_every: steps between records.
         progress_bar: whether to draw one on standard error.
+        recovery: brings a run back that goes to NaN or collapses; None lets it end with an error.
 
     Raises:
         ValueError: for numbers out of range, or learning rates without a default.
@@ -93,6 +95,7 @@ class Trainer:
         losses: Mapping[str, Loss] | None = None,
         log_every: int = 20,
         progress_bar: bool = True,
+        recovery: Recovery | None = None,
     ) -> None:
         for name, value in (
             ("num_steps", num_steps),
@@ -121,6 +124,7 @@ class Trainer:
         self.losses = nn.ModuleDict({"rgb": PhotometricLoss()} if losses is None else dict(losses))
         self.log_every = log_every
         self.progress_bar = progress_bar
+        self.recovery = recovery
 
     def fit(
         self, renderer: Renderer, frames: Frames, *, seed: int = 0, callbacks: Sequence[Callback] = ()
@@ -148,6 +152,8 @@ class Trainer:
         optimizer = self._optimizer(renderer)
         base_rates = [group["lr"] for group in optimizer.param_groups]
         num_rays, seconds, step, progress, rays_done = self.num_rays, 0.0, 0, 0.0, 0
+        if self.recovery is not None:
+            self.recovery.begin()
         renderer.train()
         self._warm_up(renderer, frames)
         with tqdm(total=100, disable=not self.progress_bar, dynamic_ncols=True, bar_format=BAR) as bar:
@@ -156,7 +162,7 @@ class Trainer:
                 renderer.set_progress(progress)
                 factor = self._learning_rate_factor(progress, step)
                 for group, rate in zip(optimizer.param_groups, base_rates):
-                    group["lr"] = rate * factor
+                    group["lr"] = rate * factor * (1.0 if self.recovery is None else self.recovery.factor)
                 renderer.update(step)
                 terms, num_samples, mse = self._step(renderer, frames, optimizer, num_rays, generator)
                 step += 1
@@ -169,11 +175,13 @@ class Trainer:
                 progress = self._progress(step, seconds)
                 if is_record or done:
                     values = {name: float(term) for name, term in terms.items()}
-                    _check_finite(values, step, renderer)
                     record = TrainingRecord(step, seconds, values, _psnr(float(mse)), used_rays, num_samples, factor)
-                    for callback in callbacks:
-                        callback(record, renderer)
-                    _show(bar, record, progress, rays_done)
+                    failed = self.recovery is not None and self.recovery.check(step, renderer, optimizer, values)
+                    if not failed:
+                        _check_finite(values, step, renderer)
+                        for callback in callbacks:
+                            callback(record, renderer)
+                        _show(bar, record, progress, rays_done)
                 if done:
                     break
         renderer.set_progress(1.0)
@@ -206,6 +214,8 @@ class Trainer:
         assert rendering.background is not None
         assert rendering.samples is not None
         target = composite_on(rgba, rendering.background)
+        if self.recovery is not None:
+            self.recovery.observe(rendering, target)
         terms = {name: loss(rendering, target, renderer) for name, loss in self.losses.items()}
         total = torch.stack(list(terms.values())).sum()
         optimizer.zero_grad(set_to_none=True)

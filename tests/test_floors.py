@@ -23,6 +23,7 @@ FLOORS = {
     "cameras": 1,
     "compositing": 1,
     "kernels": 1,
+    "quadrature": 1,
     "deformations": 2,
     "fields": 3,
     "samplers": 4,
@@ -36,6 +37,7 @@ FLOORS = {
     "plots": 6,
     "protocols": 6,
     "visualisation": 6,
+    "recovery": 6,
     # 7: whole runs.
     "checkpoints": 7,
     "consistency": 7,
@@ -57,6 +59,7 @@ FLOORS = {
 # losses about motion are losses, logs record what training, evaluation and video make.
 WITHIN_A_FLOOR = {
     ("compositing", "kernels"),
+    ("compositing", "quadrature"),
     ("encodings", "checks"),
     ("encodings", "geometry"),
     ("geometry", "checks"),

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from dnerf.backgrounds import ConstantBackground, RandomBackground
 from dnerf.cameras import Camera, Intrinsics, look_at
-from dnerf.compositing import FieldOutput, Rendering
+from dnerf.compositing import FieldOutput, Rendering, composite
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, NeRFField, RadianceField
 from dnerf.renderer import Renderer
@@ -285,3 +285,17 @@ def test_images_with_and_without_early_ends_agree_where_nothing_is_opaque() -> N
 def test_a_stop_outside_its_range_is_refused(stop: float) -> None:
     with pytest.raises(ValueError, match=r"stop_transmittance must be in \[0, 1\)"):
         Renderer(fog(), StratifiedSampler(4), stop_transmittance=stop)
+
+
+def test_quadrature_is_that_of_the_compositor() -> None:
+    rays = rays_towards_origin(50)
+    pictures = {}
+    for rule in ("constant", "linear", "parabolic"):
+        renderer = Renderer(soft_ball(), StratifiedSampler(12), quadrature=rule).eval()
+        samples = renderer.sampler(rays, renderer.field)
+        pictures[rule] = renderer(rays).rgb
+        expected = composite(samples, renderer.field(*samples.locate(rays)), torch.ones(3), quadrature=rule).rgb
+        assert torch.equal(pictures[rule], expected)
+    assert (pictures["constant"] - pictures["parabolic"]).abs().max() > 1e-4
+    with pytest.raises(ValueError, match="quadrature must be one of"):
+        Renderer(soft_ball(), StratifiedSampler(12), quadrature="cubic")

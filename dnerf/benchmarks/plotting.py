@@ -8,8 +8,8 @@ from dnerf.benchmarks.suite import BarPlot, Plot, Series
 from dnerf.checks import check_choice
 from dnerf.files import atomic_path
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5195", "#4D4D4D")
-"""Okabe and Ito's colours, which the colour-blind tell apart, and two more."""
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5195", "#4D4D4D", "#8C6D31", "#B22222")
+"""Okabe and Ito's colours, which the colour-blind tell apart, and four more."""
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 STYLES = ("line", "points", "guide")
 
@@ -27,7 +27,7 @@ def draw(plot: Plot | BarPlot, path: Path) -> None:
         axes.set_xlabel(plot.x_label)
         axes.spines[["top", "right"]].set_visible(False)
         if isinstance(plot, BarPlot):
-            _draw_bars(axes, plot)
+            _draw_bars(figure, axes, plot)
         else:
             _draw_lines(figure, axes, plot)
         with atomic_path(path) as temporary:
@@ -51,7 +51,7 @@ def _draw_lines(figure: Any, axes: Any, plot: Plot) -> None:
     _label_ends(figure, axes, [end for end in ends if end is not None])
 
 
-def _draw_bars(axes: Any, plot: BarPlot) -> None:
+def _draw_bars(figure: Any, axes: Any, plot: BarPlot) -> None:
     count = len(plot.values)
     height = 0.8 / count
     for index, (label, lengths) in enumerate(plot.values.items()):
@@ -61,7 +61,10 @@ def _draw_bars(axes: Any, plot: BarPlot) -> None:
         axes.bar_label(bars, texts, fontsize=8)
     axes.set_yticks(range(len(plot.categories)), plot.categories)
     axes.invert_yaxis()
-    axes.legend(frameon=False, loc="lower right", fontsize=10)
+    if plot.log:
+        axes.set_xscale("log")
+    axes.margins(x=0.12)
+    figure.legend(frameon=False, loc="outside lower center", ncols=count, fontsize=10)
 
 
 def _pyplot() -> Any:
@@ -124,20 +127,43 @@ def _label_ends(figure: Any, axes: Any, ends: list[tuple[float, float, str, str]
     bottom, top = axes.bbox.y0, axes.bbox.y1
     spacing = 10 * figure.dpi / 72 * 1.25
     heights = [float(axes.transData.transform((x, y))[1]) for x, y, _, _ in ends]
-    order = sorted(range(len(ends)), key=lambda i: heights[i])
-    placed: dict[int, float] = {}
-    floor = bottom
-    for i in order:
-        placed[i] = floor = max(heights[i], floor)
-        floor += spacing
-    ceiling = top
-    for i in reversed(order):
-        placed[i] = min(placed[i], ceiling)
-        ceiling = placed[i] - spacing
+    placed = spread_out(heights, spacing, bottom, top)
     for i, (x, y, text, color) in enumerate(ends):
         height = (placed[i] - bottom) / (top - bottom)
         axes.annotate(
             text, (x, y), xycoords="data", xytext=(1.02, height), textcoords="axes fraction", color=color, fontsize=10,
             va="center", annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.5, "shrinkA": 0, "shrinkB": 3},
+            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.5, "shrinkA": 0, "shrinkB": 3,
+                        "relpos": (0, 0.5)},
         )  # fmt: skip
+
+
+def spread_out(heights: list[float], spacing: float, low: float, high: float) -> list[float]:
+    """Move heights apart to at least `spacing`, as little as possible and each group about its own mean.
+
+    Args:
+        heights: any order.
+        spacing: least distance; smaller where the range does not hold so many.
+        low: lowest allowed.
+        high: highest allowed.
+    """
+    spacing = min(spacing, (high - low) / max(len(heights) - 1, 1))
+    groups: list[list[int]] = []
+    for index in sorted(range(len(heights)), key=lambda i: heights[i]):
+        groups.append([index])
+        while len(groups) > 1 and _middle(groups[-1], heights, spacing, low, high) - _middle(
+            groups[-2], heights, spacing, low, high
+        ) < spacing * 0.5 * (len(groups[-1]) + len(groups[-2])):
+            groups[-2:] = [groups[-2] + groups[-1]]
+    placed = [0.0] * len(heights)
+    for group in groups:
+        middle = _middle(group, heights, spacing, low, high)
+        for place, index in enumerate(group):
+            placed[index] = middle + (place - 0.5 * (len(group) - 1)) * spacing
+    return placed
+
+
+def _middle(group: list[int], heights: list[float], spacing: float, low: float, high: float) -> float:
+    """Middle of a group of labels: their mean height, as far as the group fits into the range."""
+    half = 0.5 * (len(group) - 1) * spacing
+    return min(max(sum(heights[i] for i in group) / len(group), low + half), high - half)

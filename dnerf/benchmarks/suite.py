@@ -90,6 +90,7 @@ class BarPlot:
         categories: labels of the groups, from top to bottom.
         values: lengths by label of the bars, one per category; NaN for none.
         note: one sentence on how to read it.
+        log: whether lengths are on a logarithmic axis.
     """
 
     name: str
@@ -98,6 +99,7 @@ class BarPlot:
     categories: Sequence[str]
     values: Mapping[str, Sequence[float]]
     note: str = ""
+    log: bool = False
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ SAMPLERS: dict[str, Callable[[], Sampler]] = {
     "importance, own proposal": lambda: ImportanceSampler(8, 12, soft_ball(width=0.6)),
     "occupancy, all of a box": lambda: OccupancySampler(BOX.tolist(), 0.1, 8, num_slabs=4),
     "occupancy, filled": filled_occupancy,
+    "importance, linear": lambda: ImportanceSampler(8, 12, box=BOX, quadrature="linear"),
     "importance in a box": lambda: ImportanceSampler(8, 12, box=BOX),
 }
 

@@ -1,0 +1,199 @@
+"""What pruning costs and saves: occupancy threshold, grid resolution, time slabs, transmittance cut-off."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dnerf.benchmarks.scenes import scene_overrides
+from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
+from dnerf.benchmarks.timing import time_in_turn
+from dnerf.data.frames import Frames
+from dnerf.renderer import Renderer
+from dnerf.samplers import OccupancySampler
+
+PROBES = 4
+FLOOR = 1e-8  # error that is drawn for none
+
+KNOBS = {
+    "threshold": "occupancy threshold (1 / world unit)",
+    "resolution": "occupancy cells along the longest side",
+    "slabs": "occupancy slabs of time",
+    "cut-off": "transmittance at which a ray ends",
+}
+
+
+def run(settings: Settings) -> SuiteResult:
+    """Train a model, then render a few frames with every setting; the reference leaves out nothing."""
+    options = settings.options
+    resolution = 48 if settings.quick else options["resolution"]
+    parts = settings.parts(
+        f"experiment={options['experiment']}",
+        *scene_overrides(options["scene"], resolution, options["data_root"], settings.quick),
+        f"trainer.max_seconds={5 if settings.quick else options['train_seconds']}", "trainer.progress_bar=false",
+    )  # fmt: skip
+    renderer, frames = parts["renderer"].to(settings.device), parts["data"].frames("test").to(settings.device)
+    parts["trainer"].fit(renderer, parts["data"].frames("train"), seed=settings.seed)
+    trained = renderer.sampler
+    if not isinstance(trained, OccupancySampler):
+        raise ValueError(f"pruning.experiment must sample by occupancy, got {type(trained).__name__}")
+    chosen = [0, len(frames) // 2]
+    everything = _grid(trained, resolution=8, num_slabs=1)
+    everything.occupied.fill_(True)
+    everything.skips.zero_()
+    reference = _pictures(renderer, everything, frames, chosen)
+    rows = [
+        _measure(renderer, sampler, frames, chosen, reference, settings, knob, value, cut)
+        for knob, value, sampler, cut in _settings(renderer, trained, options, settings)
+    ]
+    full = next(row for row in rows if row["knob"] == "nothing left out")
+    for row in rows:
+        row["times_faster"] = full["median_ms"] / row["median_ms"]
+    return SuiteResult(
+        title="Pruning: error introduced against time saved",
+        summary=(
+            f"`experiment={options['experiment']}` trained on `{options['scene']}`; two test frames of {resolution} x "
+            f"{resolution} pixels rendered in evaluation mode with every setting of one knob at a time. Occupancy "
+            "grids are filled from the finished field (`OccupancySampler.fill`, random probes of every cell), so that "
+            "their error is what a setting loses; `as trained` is the grid that training left behind. The "
+            "reference samples the whole box at the same step and leaves out nothing: errors are of pruning alone, "
+            "not of the model."
+        ),
+        tables=[
+            Table(
+                "Settings",
+                rows,
+                "worst_pixel: largest difference of any channel from the reference; psnr_to_reference in dB "
+                "(above 60 dB no 8-bit picture changes much).",
+            )
+        ],
+        plots=[_plot(rows)],
+        findings=_findings(rows),
+    )
+
+
+def _grid(trained: OccupancySampler, *, resolution: int, num_slabs: int, threshold: float = 1.0) -> OccupancySampler:
+    grid = OccupancySampler(
+        trained.box.tolist(), trained.step_size, resolution, num_slabs=num_slabs, threshold=threshold,
+        margin=trained.margin, pad_to=trained.pad_to,
+    )  # fmt: skip
+    return grid.to(trained.box.device).eval()
+
+
+def _settings(
+    renderer: Renderer, trained: OccupancySampler, options: Mapping[str, Any], settings: Settings
+) -> Iterator[tuple[str, float | None, OccupancySampler, float]]:
+    """Knob, its value, the sampler and the cut-off of every setting."""
+    slabs, cells = int(trained.shape[0]), int(trained.shape[1:].max())
+    if settings.quick:
+        slabs, cells = 4, 16
+    few = slice(None, None, 3) if settings.quick else slice(None)
+
+    def filled(**changes: Any) -> OccupancySampler:
+        grid = _grid(trained, **{"resolution": cells, "num_slabs": slabs, "threshold": trained.threshold, **changes})
+        with torch.no_grad():
+            grid.fill(renderer.field, 1 if settings.quick else PROBES)
+        return grid
+
+    everything = _grid(trained, resolution=8, num_slabs=1)
+    everything.occupied.fill_(True)
+    everything.skips.zero_()
+    yield "nothing left out", None, everything, 0.0
+    yield "as trained", None, trained, 0.0
+    for value in options["thresholds"][few]:
+        yield "threshold", value, filled(threshold=value), 0.0
+    for value in options["resolutions"][few]:
+        yield "resolution", value, filled(resolution=value), 0.0
+    for value in options["slabs"][few]:
+        yield "slabs", value, filled(num_slabs=value), 0.0
+    if hasattr(renderer, "stop_transmittance"):
+        for value in options["cuts"][few]:
+            yield "cut-off", value, trained, value
+
+
+@contextmanager
+def _using(renderer: Renderer, sampler: OccupancySampler, cut: float) -> Iterator[None]:
+    """Render with another sampler and cut-off within a `with` block."""
+    before = renderer.sampler, getattr(renderer, "stop_transmittance", None)
+    renderer.sampler = sampler
+    if before[1] is not None:
+        renderer.stop_transmittance = cut  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        renderer.sampler = before[0]
+        if before[1] is not None:
+            renderer.stop_transmittance = before[1]
+
+
+def _pictures(
+    renderer: Renderer, sampler: OccupancySampler, frames: Frames, chosen: list[int], cut: float = 0.0
+) -> Tensor:
+    with _using(renderer, sampler, cut):
+        return torch.stack([renderer.render_image(frames.camera(i), float(frames.times[i])).rgb for i in chosen])
+
+
+def _measure(
+    renderer: Renderer, sampler: OccupancySampler, frames: Frames, chosen: list[int], reference: Tensor,
+    settings: Settings, knob: str, value: float | None, cut: float,
+) -> dict[str, Any]:  # fmt: skip
+    def call() -> Tensor:
+        return _pictures(renderer, sampler, frames, chosen, cut)
+
+    difference = (call() - reference).abs()
+    error = float(difference.square().mean())
+    timing = time_in_turn(
+        {"call": call}, seconds=0.1 if settings.quick else 2.0, min_repeats=2 if settings.quick else 3,
+        device=settings.device,
+    )["call"]  # fmt: skip
+    samples = sum(_num_samples(renderer, sampler, frames, i) for i in chosen)
+    return {
+        "knob": knob,
+        "value": value,
+        "occupied": float(sampler.occupied.float().mean()),
+        "samples_per_ray": samples / (len(chosen) * frames.intrinsics.width * frames.intrinsics.height),
+        "rms_error": error**0.5,
+        "worst_pixel": float(difference.max()),
+        "psnr_to_reference": -10 * torch.tensor(max(error, 1e-14)).log10().item(),
+        **{name: number / len(chosen) for name, number in timing.milliseconds.items()},
+        "grid_MiB": sum(b.nbytes for b in (sampler.occupied, sampler.maxima, sampler.skips)) / 2**20,
+    }
+
+
+@torch.no_grad()
+def _num_samples(renderer: Renderer, sampler: OccupancySampler, frames: Frames, index: int) -> int:
+    samples = sampler(frames.camera(index).rays(float(frames.times[index])), renderer.field)
+    return int((samples.lengths > 0).sum())
+
+
+def _plot(rows: list[dict[str, Any]]) -> Plot:
+    series = []
+    for knob in dict.fromkeys(row["knob"] for row in rows):
+        part = [row for row in rows if row["knob"] == knob]
+        x, y = [row["median_ms"] for row in part], [max(row["rms_error"], FLOOR) for row in part]
+        notes = ["" if row["value"] is None else f"{row['value']:g}" for row in part]
+        label = KNOBS.get(knob, knob)
+        series.append(Series(label, x, y, notes=notes, style="points" if len(part) == 1 else "line"))
+    return Plot(
+        name="pruning",
+        title="Error that pruning introduces against the time of a frame",
+        x_label="time per frame (ms)",
+        y_label="root-mean-square difference from leaving out nothing",
+        series=series,
+        note="Down and left is better; numbers are the knob's value. Half an 8-bit step is 2e-3; 1e-8 stands for none.",
+    )
+
+
+def _findings(rows: list[dict[str, Any]]) -> list[str]:
+    findings = []
+    for knob, what in KNOBS.items():
+        good = [row for row in rows if row["knob"] == knob and row["rms_error"] < 1e-3]
+        if good:
+            best = max(good, key=lambda row: row["times_faster"])
+            findings.append(
+                f"{what}: the fastest below an error of 1e-3 is {best['value']:g}, {best['times_faster']:.1f} times "
+                f"faster than leaving out nothing, error {best['rms_error']:.1e}, worst {best['worst_pixel']:.1e}."
+            )
+    return findings
