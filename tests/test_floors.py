@@ -17,6 +17,7 @@ FLOORS = {
     "geometry": 0,
     "mlp": 0,
     "rays": 0,
+    "stopping": 0,
     # 1: one ray at a time.
     "backgrounds": 1,
     "cameras": 1,
@@ -36,6 +37,7 @@ FLOORS = {
     "evaluation": 7,
     "logs": 7,
     "report": 7,
+    "run_state": 7,
     "training": 7,
     "video": 7,
     "viewer": 7,
@@ -53,6 +55,9 @@ WITHIN_A_FLOOR = {
     ("logs", "video"),
     ("mlp", "checks"),
     ("rays", "checks"),
+    ("run_state", "checkpoints"),
+    ("training", "distributed"),
+    ("training", "run_state"),
 }
 
 ONLY_SCRIPTS_KNOW = {"hydra", "omegaconf"}

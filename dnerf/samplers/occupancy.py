@@ -43,6 +43,8 @@ class OccupancySampler(Sampler):
         ValueError: for numbers out of range.
     """
 
+    observed = ("maxima",)
+
     def __init__(
         self,
         box: Sequence[Sequence[float]],
