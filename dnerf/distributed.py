@@ -5,6 +5,7 @@ rounding of sums. Start with `torchrun --nproc_per_node=2 scripts/train.py ...`.
 """
 
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -53,7 +54,10 @@ class Processes:
         """
         if self.size == 1:
             return renderer
-        return DistributedDataParallel(renderer, broadcast_buffers=False, find_unused_parameters=True)
+        with warnings.catch_warnings():
+            # The argument's successor exchanges buffers at the start, which is as good, but is younger than torch 2.6.
+            warnings.simplefilter("ignore", FutureWarning)
+            return DistributedDataParallel(renderer, broadcast_buffers=False, find_unused_parameters=True)
 
     def same_randomness(self, generator: torch.Generator, num_rays: int) -> AbstractContextManager[Any]:
         """While it lasts, draw from the generator what one process with all the rays would, and keep this share.

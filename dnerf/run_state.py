@@ -1,10 +1,11 @@
 """Where a training run stands: everything that a step changes, as tensors and JSON values, and its checkpoints."""
 
+import hashlib
 import logging
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.checkpoints import MAX_HEADER, check_fit, decode, encode, num_bytes, read_limited
-from dnerf.files import remove_leftovers, write_bytes
+from dnerf.data.frames import Frames
+from dnerf.files import write_bytes
+from dnerf.records import not_finite
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +37,7 @@ class RunState:
         seconds: training time spent.
         rays_done: rays of all steps done.
         record: the last record of training as JSON values, or None before the first.
+        data: fingerprint of the frames that are learnt, "" if nobody asks.
     """
 
     modules: Mapping[str, nn.Module]
@@ -43,7 +47,8 @@ class RunState:
     step: int = 0
     seconds: float = 0.0
     rays_done: int = 0
-    record: dict[str, Any] | None = field(default=None)
+    record: dict[str, Any] | None = None
+    data: str = ""
 
     def encode(self) -> bytes:
         """The state as the bytes of one file."""
@@ -55,6 +60,7 @@ class RunState:
             "num_rays": self.num_rays,
             "rays_done": self.rays_done,
             "record": self.record,
+            "data": self.data,
         }
         return encode({**self._modules(), **self._moments(), **self._random_states()}, facts)
 
@@ -75,6 +81,8 @@ class RunState:
             raise ValueError(f"{where}: {error}") from error
         device = self.generator.device.type
         checked = _checked_facts(facts, where, device, max_rays)
+        if checked.get("data") != self.data:
+            raise ValueError(f"{where}: the training frames are not those that this run began with")
         expected = {**self._modules(), **self._random_states()}
         moments = {name: value for name, value in tensors.items() if name.startswith("optimizer.")}
         check_fit(expected, {name: value for name, value in tensors.items() if name not in moments}, where)
@@ -175,19 +183,31 @@ class CheckpointFolder:
         self.folder = Path(folder)
         self._good: Path | None = None
 
-    def save(self, state: RunState) -> Path:
+    def save(self, state: RunState, *, must_succeed: bool = True) -> None:
         """Write a checkpoint, then remove all but it and the last one that was written or read well.
+
+        Args:
+            state: what to write.
+            must_succeed: whether a full disk is an error; otherwise it is a warning, and training can go on.
 
         Raises:
             OSError: if it cannot be written; those that were there stay.
+            FloatingPointError: if parameters are not finite: such a state is not worth keeping.
         """
         path = self.folder / f"step_{state.step:08d}.safetensors"
-        write_bytes(path, state.encode())
+        if names := not_finite(state.modules["renderer"]):
+            raise FloatingPointError(f"step {state.step}: parameters not finite: {', '.join(names)}")
+        try:
+            write_bytes(path, state.encode())
+        except OSError as error:
+            if must_succeed:
+                raise
+            logger.warning("step %d: no checkpoint, the last one stays: %s", state.step, error)
+            return
         for other in self._files():
             if other not in (path, self._good):
                 other.unlink(missing_ok=True)
         self._good = path
-        return path
 
     def read(self, max_bytes: int) -> bytes | None:
         """The newest checkpoint that is whole, or None if there are none at all.
@@ -211,10 +231,6 @@ class CheckpointFolder:
             raise ValueError(f"{self.folder}: no checkpoint can be read; {problems[0]}")
         return None
 
-    def clean(self) -> None:
-        """Remove what a killed process left half written."""
-        remove_leftovers(self.folder)
-
     def _files(self) -> list[Path]:
         return [path for path in self.folder.glob("step_*.safetensors") if NAME.fullmatch(path.name)]
 
@@ -223,6 +239,14 @@ def _step(path: Path) -> int:
     match = NAME.fullmatch(path.name)
     assert match is not None
     return int(match[1])
+
+
+def fingerprint(frames: Frames) -> str:
+    """A digest of pictures, poses, times and camera."""
+    digest = hashlib.sha256(repr((frames.intrinsics, frames.near, frames.far, frames.background)).encode())
+    for tensor in (frames.images, frames.poses, frames.times):
+        digest.update(tensor.cpu().contiguous().numpy().data)
+    return digest.hexdigest()
 
 
 def max_bytes(modules: Mapping[str, nn.Module]) -> int:

@@ -5,11 +5,10 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from signal import Signals
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
@@ -17,37 +16,15 @@ from dnerf.checks import check_choice, check_positive
 from dnerf.data.frames import Frames, composite_on
 from dnerf.distributed import Processes
 from dnerf.losses import Loss, PhotometricLoss
+from dnerf.records import Outcome, TrainingRecord, check_finite, psnr_of, show
 from dnerf.renderer import Renderer
-from dnerf.run_state import CheckpointFolder, RunState, max_bytes
+from dnerf.run_state import CheckpointFolder, RunState, fingerprint, max_bytes
 from dnerf.stopping import StopRequest, TrainingStopped, stop_requests
 
 logger = logging.getLogger(__name__)
 
 BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
 SCHEDULES = ("exponential", "cosine", "constant")
-
-
-@dataclass(frozen=True)
-class TrainingRecord:
-    """What one step of training looked like.
-
-    Args:
-        step: number of steps done, this one included.
-        seconds: time spent training so far, callbacks and data loading left out.
-        losses: each loss term by name; "loss" is their sum.
-        psnr: of the batch's colours, in dB.
-        num_rays: rays of the batch.
-        num_samples: field evaluations of the batch.
-        learning_rate_factor: of the schedule, in [0, 1].
-    """
-
-    step: int
-    seconds: float
-    losses: Mapping[str, float]
-    psnr: float
-    num_rays: int
-    num_samples: int
-    learning_rate_factor: float
 
 
 Callback = Callable[[TrainingRecord, Renderer], None]
@@ -172,6 +149,8 @@ class Trainer:
         generator = torch.Generator(renderer.device).manual_seed(seed)
         modules = {"renderer": renderer, "losses": self.losses}
         run = RunState(modules, self._optimizer(renderer), generator, max(self.num_rays, processes.size))
+        if checkpoints is not None:
+            run.data = fingerprint(frames)
         renderer.train()
         self._warm_up(renderer, frames)
         if resume and checkpoints is not None:
@@ -192,18 +171,18 @@ class Trainer:
                 ends, is_due = self._is_finished(run), self._is_due(run.step)
                 if ends or run.step == 1 or run.step % self.log_every == 0:
                     numbers = processes.mean(outcome.numbers())
-                    _check_finite(numbers, run.step, renderer)
-                    psnr = _psnr(numbers.pop("mse"))
+                    check_finite(numbers, run.step, renderer)
+                    psnr = psnr_of(numbers.pop("mse"))
                     run.record = vars(
                         TrainingRecord(run.step, run.seconds, numbers, psnr, used_rays, num_samples, outcome.factor)
                     )
                     if processes.is_first:
                         _report(run, renderer, callbacks)
-                        _show(bar, TrainingRecord(**run.record), self._progress(run), run.rays_done)
+                        show(bar, TrainingRecord(**run.record), self._progress(run), run.rays_done)
                 if checkpoints is not None and (ends or is_due or signal):
                     processes.merge_observations(renderer)
                     if processes.is_first:
-                        _save(run, checkpoints, is_last=bool(ends or signal))
+                        checkpoints.save(run, must_succeed=bool(ends or signal))
                 if signal and not ends:
                     raise TrainingStopped(signal, f"stopped by {Signals(signal).name} after step {run.step}, all saved")
         renderer.set_progress(1.0)
@@ -223,7 +202,7 @@ class Trainer:
             loss.backward()
         renderer.zero_grad(set_to_none=True)
 
-    def _step(self, run: RunState, model: nn.Module, frames: Frames, processes: Processes) -> "_Outcome":
+    def _step(self, run: RunState, model: nn.Module, frames: Frames, processes: Processes) -> Outcome:
         """One optimiser step on this process's share of a random batch."""
         renderer, progress = run.modules["renderer"], self._progress(run)
         assert isinstance(renderer, Renderer)
@@ -251,7 +230,7 @@ class Trainer:
             run.optimizer.step()
         mse = (rendering.rgb.detach() - target).square().mean()
         detached = {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse}.items()}
-        return _Outcome(detached, weight, rendering.samples.starts.numel(), factor)
+        return Outcome(detached, weight, rendering.samples.starts.numel(), factor)
 
     def _optimizer(self, renderer: Renderer) -> torch.optim.Optimizer:
         groups: dict[str, list[nn.Parameter]] = {prefix: [] for prefix in self.learning_rates}
@@ -295,20 +274,6 @@ class Trainer:
         return warmup
 
 
-@dataclass(frozen=True)
-class _Outcome:
-    """What one step says: scalars by name, the weight of this process's share in their mean, and counts."""
-
-    scalars: Mapping[str, Tensor]
-    weight: float
-    num_samples: int
-    factor: float
-
-    def numbers(self) -> dict[str, float]:
-        """The scalars, weighted; this waits for the device."""
-        return {name: float(value) * self.weight for name, value in self.scalars.items()}
-
-
 def _report(run: RunState, renderer: Renderer, callbacks: Sequence[Callback]) -> None:
     """Call the callbacks; one that cannot write (a full disk) costs its output, not the run."""
     for callback in callbacks:
@@ -316,17 +281,6 @@ def _report(run: RunState, renderer: Renderer, callbacks: Sequence[Callback]) ->
             callback(TrainingRecord(**(run.record or {})), renderer)
         except OSError as error:
             logger.warning("step %d: %s failed: %s", run.step, type(callback).__name__, error)
-
-
-def _save(run: RunState, checkpoints: CheckpointFolder, *, is_last: bool) -> None:
-    """Write a checkpoint; only the last one must succeed."""
-    _check_parameters(run.modules["renderer"], run.step)
-    try:
-        checkpoints.save(run)
-    except OSError as error:
-        if is_last:
-            raise
-        logger.warning("step %d: no checkpoint, the last one stays: %s", run.step, error)
 
 
 @contextmanager
@@ -339,33 +293,3 @@ def _advice_on_memory(run: RunState) -> Iterator[None]:
             "trainer.target_samples or trainer.max_rays, or set renderer.precision=bfloat16; a checkpoint, if there "
             f"is one, is good ({' '.join(str(error).split())[:120]})"
         ) from error
-
-
-def _show(bar: tqdm, record: TrainingRecord, progress: float, rays_done: int) -> None:
-    remaining = record.seconds * (1 - progress) / max(progress, 1e-9)
-    bar.n = round(100 * progress, 1)
-    bar.set_postfix_str(
-        f"step {record.step:,}, loss {record.losses['loss']:.4f}, PSNR {record.psnr:.2f} dB, "
-        f"{rays_done / record.seconds:,.0f} rays/s, ETA {remaining:.0f} s"
-    )
-
-
-def _psnr(mse: float) -> float:
-    return -10 * math.log10(max(mse, 1e-12))
-
-
-def _check_finite(numbers: Mapping[str, float], step: int, renderer: nn.Module) -> None:
-    broken = [name for name, value in numbers.items() if not math.isfinite(value)]
-    if broken:
-        parameters = ", ".join(_not_finite(renderer)) or "none"
-        raise FloatingPointError(f"step {step}: {', '.join(broken)} not finite; parameters not finite: {parameters}")
-
-
-def _check_parameters(renderer: nn.Module, step: int) -> None:
-    """A checkpoint must be worth keeping."""
-    if names := _not_finite(renderer):
-        raise FloatingPointError(f"step {step}: parameters not finite: {', '.join(names)}")
-
-
-def _not_finite(renderer: nn.Module) -> list[str]:
-    return [name for name, p in renderer.named_parameters() if not bool(torch.isfinite(p).all())]

@@ -31,6 +31,7 @@ FLOORS = {
     "data": 6,
     "losses": 6,
     "metrics": 6,
+    "records": 6,
     # 7: whole runs.
     "checkpoints": 7,
     "distributed": 7,
