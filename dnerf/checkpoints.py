@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from dnerf.files import write_bytes
 
 MAX_HEADER = 16 * 2**20  # bytes of a file beyond its tensors
-METADATA = "__metadata__"
+ENTRY = "dnerf"  # of the file's metadata: facts and digest
 
 
 def encode(tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> bytes:
@@ -29,7 +29,8 @@ def encode(tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> bytes:
         name: value.detach().cpu().clone(memory_format=torch.contiguous_format) for name, value in tensors.items()
     }
     text = json.dumps(facts, allow_nan=False, sort_keys=True)
-    return save(copies, metadata={"facts": text, "digest": _digest(copies, text)})
+    # One entry, because the format writes several in any order, and equal contents shall give equal files.
+    return save(copies, metadata={ENTRY: json.dumps({"digest": _digest(copies, text), "facts": text})})
 
 
 def decode(data: bytes) -> tuple[dict[str, Tensor], dict[str, Any] | None]:
@@ -41,15 +42,16 @@ def decode(data: bytes) -> tuple[dict[str, Tensor], dict[str, Any] | None]:
     try:
         tensors = load(data)
         length = int.from_bytes(data[:8], "little")
-        metadata = json.loads(data[8 : 8 + length]).get(METADATA) or {}
-        text = str(metadata.get("facts"))
-        digest = _digest(tensors, text) if "digest" in metadata else None
+        entry = (json.loads(data[8 : 8 + length]).get("__metadata__") or {}).get(ENTRY)
+        if entry is None:
+            return tensors, None
+        stated = json.loads(entry)
+        text = str(stated["facts"])
+        digest = _digest(tensors, text)
     # A decoder given hostile bytes raises many types (SafetensorError, KeyError, RuntimeError of unusual dtypes, ...).
     except Exception as error:
         raise ValueError(f"not a readable safetensors file ({_one_line(error) or type(error).__name__})") from error
-    if digest is None:
-        return tensors, None
-    if metadata["digest"] != digest:
+    if stated["digest"] != digest:
         raise ValueError("not a readable safetensors file (damaged: its contents do not match their digest)")
     # From here on the text is what `encode` was given, unless somebody made the file on purpose.
     try:

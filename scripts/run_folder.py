@@ -120,7 +120,8 @@ def opened(config: DictConfig) -> Iterator[Path]:
         with open_dict(saved):
             saved.out_dir, saved.resume = str(folder), False
         write_text(folder / "config.yaml", OmegaConf.to_yaml(saved, resolve=True))
-        write_json(folder / "overrides.json", list(HydraConfig.get().overrides.task))
+        if not (folder / "overrides.json").exists():
+            write_json(folder / "overrides.json", list(HydraConfig.get().overrides.task))
         yield folder
 
 

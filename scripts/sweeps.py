@@ -7,6 +7,7 @@ import csv
 import hashlib
 import io
 import json
+import re
 import shutil
 import sys
 import traceback
@@ -57,7 +58,8 @@ def sweep_folder() -> Path:
 def job_name() -> str:
     """This job's name: what it varies, fit for a file name."""
     job = HydraConfig.get().job
-    name = str(job.override_dirname or job.num).replace("/", "_")
+    # Only characters that Hydra's command line takes without quotes, so that a run's folder can be named there.
+    name = re.sub(r"[^\w.+-]", "_", str(job.override_dirname or job.num))
     if len(name) <= NAME_LENGTH:
         return name
     return f"{name[: NAME_LENGTH - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
