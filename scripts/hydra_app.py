@@ -31,7 +31,8 @@ from dnerf.stopping import TrainingStopped
 
 WRONG_INPUT = 2
 USER_ERRORS = (ValueError, OSError, MemoryError, LostProcess, HydraException, OmegaConfBaseException)
-MAX_CONFIG_BYTES = 256 * 1024
+MAX_CONFIG_BYTES = 64 * 1024
+MAX_CONFIG_DEPTH = 40
 
 CONF = str(Path(__file__).resolve().parents[1] / "conf")
 
@@ -176,10 +177,12 @@ def load_config(run: str) -> DictConfig:
     if not path.is_file():
         raise ValueError(f"run: {path} does not exist; {run} is not the folder of a run")
     try:
-        config = OmegaConf.create(_plain_yaml(path))
+        value = _plain_yaml(path)
+        config = OmegaConf.create(value)
     except Exception as error:
         raise ValueError(f"{path}: not a readable config ({one_line(error)})") from error
-    if not isinstance(config, DictConfig) or "renderer" not in config or "data" not in config:
+    groups = [value.get(name) if isinstance(value, dict) else None for name in ("renderer", "data")]
+    if not isinstance(config, DictConfig) or not all(isinstance(group, dict) for group in groups):
         raise ValueError(f"{path}: expected a mapping with renderer and data, not the config of a run")
     container = OmegaConf.to_container(config, resolve=False)
     if "${" in str(container):
@@ -192,15 +195,18 @@ def load_config(run: str) -> DictConfig:
 
 
 def _plain_yaml(path: Path) -> Any:
-    """The value of a YAML file that is small and repeats nothing by reference, which could unfold without bound."""
+    """The value of a small YAML file, neither deep nor with references, which could unfold without bound."""
     with path.open("rb") as file:
         data = file.read(MAX_CONFIG_BYTES + 1)
     if len(data) > MAX_CONFIG_BYTES:
         raise ValueError(f"more than {MAX_CONFIG_BYTES} bytes")
-    text = data.decode()
-    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
-        raise ValueError("aliases are not supported")
-    return yaml.safe_load(text)
+    text, depth = data.decode(), 0
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    for event in yaml.parse(text, loader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_CONFIG_DEPTH or isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"aliases and more than {MAX_CONFIG_DEPTH} levels are not supported")
+    return yaml.load(text, loader)
 
 
 def load_renderer(run: str, config: DictConfig, device: torch.device) -> Renderer:
