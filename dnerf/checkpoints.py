@@ -46,12 +46,12 @@ def decode(data: bytes) -> tuple[dict[str, Tensor], dict[str, Any] | None]:
         if entry is None:
             return tensors, None
         stated = json.loads(entry)
-        text = str(stated["facts"])
+        text, known = str(stated["facts"]), stated["digest"]
         digest = _digest(tensors, text)
     # A decoder given hostile bytes raises many types (SafetensorError, KeyError, RuntimeError of unusual dtypes, ...).
     except Exception as error:
         raise ValueError(f"not a readable safetensors file ({_one_line(error) or type(error).__name__})") from error
-    if stated["digest"] != digest:
+    if known != digest:
         raise ValueError("not a readable safetensors file (damaged: its contents do not match their digest)")
     # From here on the text is what `encode` was given, unless somebody made the file on purpose.
     try:

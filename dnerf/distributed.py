@@ -5,6 +5,7 @@ rounding of sums. Start with `torchrun --nproc_per_node=2 scripts/train.py ...`.
 """
 
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -20,6 +21,9 @@ from torch.overrides import TorchFunctionMode
 
 from dnerf.renderer import Renderer
 from dnerf.samplers import Sampler
+
+# What gloo and NCCL say, as plain RuntimeErrors, when another process does not answer.
+LOST = re.compile("gloo|nccl|timed out|timeout|connection|peer", re.IGNORECASE)
 
 
 class LostProcess(RuntimeError):
@@ -135,8 +139,7 @@ class Processes:
         try:
             yield
         except RuntimeError as error:
-            lost = isinstance(error, dist.DistError) or "gloo" in str(error)
-            if self.size == 1 or not lost:
+            if self.size == 1 or not (isinstance(error, dist.DistError) or LOST.search(str(error))):
                 raise
             reason = " ".join(str(error).split())[:200]
             raise LostProcess(

@@ -5,7 +5,7 @@ import logging
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from dnerf.checkpoints import MAX_HEADER, check_fit, decode, encode, num_bytes, read_limited
 from dnerf.data.frames import Frames
 from dnerf.files import write_bytes
-from dnerf.records import not_finite
+from dnerf.records import TrainingRecord, not_finite
 
 logger = logging.getLogger(__name__)
 
@@ -149,9 +149,18 @@ def _checked_facts(facts: dict[str, Any] | None, where: object, device: str, max
     seconds = facts.get("seconds")
     if not isinstance(seconds, float) or not 0 <= seconds < math.inf:
         raise ValueError(f"{where}: seconds must be a number >= 0, got {str(seconds)[:40]}")
-    if not isinstance(facts.get("record"), dict | None):
-        raise ValueError(f"{where}: record must be an object or null, got {type(facts['record']).__name__}")
-    return facts
+    if facts.get("record") is not None:
+        _check_record(facts["record"], where)
+    return {"record": None, **facts}
+
+
+def _check_record(record: object, where: object) -> None:
+    names = {field.name for field in fields(TrainingRecord)}
+    if not isinstance(record, dict) or record.keys() != names or not isinstance(record["losses"], dict):
+        raise ValueError(f"{where}: record must be an object with {', '.join(sorted(names))}, or null")
+    for name, value in {**record["losses"], **{k: v for k, v in record.items() if k != "losses"}}.items():
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise ValueError(f"{where}: record.{name[:40]} must be a number, got {str(value)[:40]}")
 
 
 def _optimizer_state(

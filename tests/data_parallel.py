@@ -193,7 +193,7 @@ def main() -> None:
     result: dict[str, Any] = {model: compare(model, given.steps, given.processes) for model in MODELS}
     if given.mishaps:
         result["killed"] = mishap(signal.SIGKILL, 1, 60)
-        result["hanging"] = mishap(signal.SIGSTOP, 1, 3)
+        result["hanging"] = mishap(signal.SIGSTOP, 1, 8)
         result["told to stop"] = mishap(signal.SIGTERM, 1, 60)
     sys.stdout.write(json.dumps(result, indent=1) + "\n")
 

@@ -14,6 +14,7 @@ from dnerf.checkpoints import decode, encode
 from dnerf.data import SyntheticData
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, GridField
+from dnerf.records import TrainingRecord
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder, RunState, max_bytes
 from dnerf.samplers import OccupancySampler
@@ -47,7 +48,7 @@ def state_of(renderer: Renderer, step: int = 5) -> RunState:
     for parameter in renderer.parameters():
         parameter.grad = torch.rand(parameter.shape, generator=generator)
     optimizer.step()
-    record = {"step": step, "loss": 0.1}
+    record = vars(TrainingRecord(step, 1.25, {"loss": 0.1}, 10.0, 37, 300, 0.5))
     return RunState({"renderer": renderer}, optimizer, generator, 37, step, 1.25, 99, record, "frames")
 
 
@@ -214,6 +215,10 @@ Edit = Callable[[dict[str, torch.Tensor], dict[str, Any]], object]
         (lambda t, f: f.update(num_rays=0), "num_rays"),
         (lambda t, f: f.update(rays_done=1.5), "rays_done"),
         (lambda t, f: f.update(record=[1]), "record"),
+        (lambda t, f: f["record"].pop("psnr"), "record must be an object with"),
+        (lambda t, f: f["record"].update(losses=3), "record must be an object with"),
+        (lambda t, f: f["record"].update(psnr="high"), "record.psnr must be a number"),
+        (lambda t, f: f["record"]["losses"].update(rgb=None), "record.rgb must be a number"),
         (lambda t, f: f.update(data="others"), "training frames"),
         (lambda t, f: t.pop("random.run"), "missing"),
         (lambda t, f: t.pop("renderer.sampler.maxima"), "missing"),
@@ -237,6 +242,22 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(edit: Edit, me
     assert "\n" not in str(error.value)
     torch.set_rng_state(drawn)
     assert state.encode() == before
+
+
+def test_a_state_without_a_record_is_one_before_the_first() -> None:
+    tensors, facts = contents(state_of(small_renderer()))
+    facts.pop("record")  # found by fuzzing: KeyError
+    state = state_of(small_renderer(1))
+    state.restore(encode(tensors, facts), "file", max_rays=64)
+    assert state.record is None
+
+
+def test_a_file_whose_entry_lacks_its_digest_is_refused(tmp_path: Path) -> None:
+    from safetensors.torch import save
+
+    for entry in ("{}", '{"facts": "{}"}', '{"digest": "00"}', "[]", "3", "nonsense"):  # found by fuzzing: KeyError
+        with pytest.raises(ValueError, match="not a readable safetensors file"):
+            decode(save({"a": torch.zeros(2)}, metadata={"dnerf": entry}))
 
 
 def test_weights_alone_cannot_be_continued(tmp_path: Path) -> None:
