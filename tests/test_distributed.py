@@ -113,7 +113,7 @@ def test_one_process_alone_needs_no_communication(tmp_path: Path) -> None:
     assert alone.mean({"loss": 2.0}) == {"loss": 2.0}
     assert alone.from_first(lambda: b"data") == b"data"
     alone.merge_observations(module)
-    with pytest.raises(RuntimeError, match="^gloo$"), alone.watched():
+    with pytest.raises(RuntimeError, match=r"^gloo$"), alone.watched():
         raise RuntimeError("gloo")
 
 
@@ -121,5 +121,5 @@ def test_one_process_alone_needs_no_communication(tmp_path: Path) -> None:
 def test_what_the_network_says_is_put_plainly(said: str) -> None:
     with pytest.raises(LostProcess, match="died or hangs"), Processes(0, 2).watched():
         raise RuntimeError(said)
-    with pytest.raises(RuntimeError, match="^shapes do not fit$"), Processes(0, 2).watched():
+    with pytest.raises(RuntimeError, match=r"^shapes do not fit$"), Processes(0, 2).watched():
         raise RuntimeError("shapes do not fit")

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 def torchrun(cwd: Path, *arguments: str) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "--standalone"]
     command += [str(ROOT / "scripts" / "train.py"), *SETTINGS, "sampler.pad_to=1", *arguments]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     return subprocess.Popen(
