@@ -170,6 +170,27 @@ def test_a_killed_worker_of_joblib_ends_the_sweep_with_an_error_and_nothing_lost
     assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "done"]
 
 
+@pytest.mark.slow
+def test_submitit_runs_each_job_in_its_own_process(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    arguments = (
+        "hydra/launcher=submitit_local",
+        "hydra.launcher.timeout_min=5",
+        "seed=0,1",
+        "field.max_rows=1000,4096",
+    )
+    done = sweep(tmp_path, *arguments)
+    assert done.returncode == 2, done.stderr
+    found = {row["run"]: row["status"] for row in rows(tmp_path / "sweep")}
+    assert found == {
+        "seed-0_field.max_rows-1000": "failed",
+        "seed-0_field.max_rows-4096": "done",
+        "seed-1_field.max_rows-1000": "failed",
+        "seed-1_field.max_rows-4096": "done",
+    }
+    assert "2 of the sweep's jobs failed" in done.stderr
+
+
 def open_folders(pid: int) -> str:
     """Targets of a process's file descriptors, joined: a run holds its folder open."""
     names = []
