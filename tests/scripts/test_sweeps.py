@@ -183,10 +183,10 @@ def test_submitit_runs_each_job_in_its_own_process(tmp_path: Path) -> None:
     assert done.returncode == 2, done.stderr
     found = {row["run"]: row["status"] for row in rows(tmp_path / "sweep")}
     assert found == {
-        "seed-0_field.max_rows-1000": "failed",
-        "seed-0_field.max_rows-4096": "done",
-        "seed-1_field.max_rows-1000": "failed",
-        "seed-1_field.max_rows-4096": "done",
+        "field.max_rows-1000_seed-0": "failed",
+        "field.max_rows-4096_seed-0": "done",
+        "field.max_rows-1000_seed-1": "failed",
+        "field.max_rows-4096_seed-1": "done",
     }
     assert "2 of the sweep's jobs failed" in done.stderr
 
