@@ -34,12 +34,19 @@ class TrainingRecord:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one step says: scalars by name, the weight of this process's share in their mean, and counts."""
+    """What one process finds in a step.
+
+    Args:
+        scalars: loss terms, "loss" and "mse", on the device.
+        weight: of this process's share of the rays in the mean over processes.
+        num_samples: field evaluations of the share.
+        learning_rate_factor: of the schedule, in [0, 1].
+    """
 
     scalars: Mapping[str, Tensor]
     weight: float
     num_samples: int
-    factor: float
+    learning_rate_factor: float
 
     def numbers(self) -> dict[str, float]:
         """The scalars, weighted; this waits for the device."""

@@ -155,40 +155,55 @@ class Trainer:
         self._warm_up(renderer, frames)
         if resume and checkpoints is not None:
             self._restore(run, checkpoints, processes)
-        model = processes.wrap(renderer)
         catching = nullcontext(StopRequest()) if checkpoints is None else stop_requests()
         is_shown = self.progress_bar and processes.is_first
         bar = tqdm(total=100, disable=not is_shown, dynamic_ncols=True, bar_format=BAR)
         with bar, catching as request, processes.watched(), _advice_on_memory(run):
-            while not self._is_finished(run):
-                begin = time.perf_counter()
-                outcome = self._step(run, model, frames, processes)
-                seconds = run.seconds + time.perf_counter() - begin
-                run.seconds, num_samples, signal = processes.agree(seconds, outcome.num_samples, request.number)
-                run.step += 1
-                used_rays, wanted_rays = run.num_rays, self._next_num_rays(run.num_rays, num_samples)
-                run.rays_done, run.num_rays = run.rays_done + used_rays, max(wanted_rays, processes.size)
-                ends, is_due = self._is_finished(run), self._is_due(run.step)
-                if ends or run.step == 1 or run.step % self.log_every == 0:
-                    numbers = processes.mean(outcome.numbers())
-                    check_finite(numbers, run.step, renderer)
-                    psnr = psnr_of(numbers.pop("mse"))
-                    run.record = vars(
-                        TrainingRecord(run.step, run.seconds, numbers, psnr, used_rays, num_samples, outcome.factor)
-                    )
-                    if processes.is_first:
-                        _report(run, renderer, callbacks)
-                        show(bar, TrainingRecord(**run.record), self._progress(run), run.rays_done)
-                if checkpoints is not None and (ends or is_due or signal):
-                    processes.merge_observations(renderer)
-                    if processes.is_first:
-                        checkpoints.save(run, must_succeed=bool(ends or signal))
-                if signal and not ends:
-                    raise TrainingStopped(signal, f"stopped by {Signals(signal).name} after step {run.step}, all saved")
+            self._loop(run, renderer, frames, processes, callbacks, checkpoints, request, bar)
         renderer.set_progress(1.0)
         renderer.eval()
         assert run.record is not None
         return TrainingRecord(**run.record)
+
+    def _loop(
+        self,
+        run: RunState,
+        renderer: Renderer,
+        frames: Frames,
+        processes: Processes,
+        callbacks: Sequence[Callback],
+        checkpoints: CheckpointFolder | None,
+        request: StopRequest,
+        bar: tqdm,
+    ) -> None:
+        """Steps, records and checkpoints until the end or a signal; every process takes the same turns."""
+        model = processes.wrap(renderer)
+        while not self._is_finished(run):
+            begin = time.perf_counter()
+            outcome = self._step(run, model, frames, processes)
+            seconds = run.seconds + time.perf_counter() - begin
+            run.seconds, num_samples, signal = processes.agree(seconds, outcome.num_samples, request.number)
+            run.step += 1
+            used_rays, wanted_rays = run.num_rays, self._next_num_rays(run.num_rays, num_samples)
+            run.rays_done, run.num_rays = run.rays_done + used_rays, max(wanted_rays, processes.size)
+            ends = self._is_finished(run)
+            if ends or run.step == 1 or run.step % self.log_every == 0:
+                numbers = processes.mean(outcome.numbers())
+                check_finite(numbers, run.step, renderer)
+                psnr = psnr_of(numbers.pop("mse"))
+                record = TrainingRecord(
+                    run.step, run.seconds, numbers, psnr, used_rays, num_samples, outcome.learning_rate_factor
+                )
+                run.record = vars(record)
+                if processes.is_first:
+                    _report(record, renderer, callbacks)
+                    show(bar, record, self._progress(run), run.rays_done)
+            if checkpoints is not None and (ends or signal or self._is_due(run.step)):
+                processes.merge_observations(renderer)
+                if processes.is_first:
+                    checkpoints.save(run, must_succeed=bool(ends or signal))
+            if signal and not ends:
+                raise TrainingStopped(signal, f"stopped by {Signals(signal).name} after step {run.step}, all saved")
 
     def _warm_up(self, renderer: Renderer, frames: Frames) -> None:
         """Run every kernel once, forward and backward, so that their compilation is not timed.
@@ -274,13 +289,13 @@ class Trainer:
         return warmup
 
 
-def _report(run: RunState, renderer: Renderer, callbacks: Sequence[Callback]) -> None:
+def _report(record: TrainingRecord, renderer: Renderer, callbacks: Sequence[Callback]) -> None:
     """Call the callbacks; one that cannot write (a full disk) costs its output, not the run."""
     for callback in callbacks:
         try:
-            callback(TrainingRecord(**(run.record or {})), renderer)
+            callback(record, renderer)
         except OSError as error:
-            logger.warning("step %d: %s failed: %s", run.step, type(callback).__name__, error)
+            logger.warning("step %d: %s failed: %s", record.step, type(callback).__name__, error)
 
 
 @contextmanager

@@ -105,7 +105,7 @@ def opened(config: DictConfig) -> Iterator[Path]:
     """Make or reopen a run's folder and hold it for this process; the resolved config lies in it.
 
     Raises:
-        ValueError: if the folder holds another run and `resume` is not set, holds no run at all, or is in use.
+        ValueError: if the folder holds another run and `resume` is not set, holds no run at all or links, or is in use.
     """
     folder = folder_of(config)
     holds_run = (folder / "config.yaml").is_file()
@@ -113,6 +113,9 @@ def opened(config: DictConfig) -> Iterator[Path]:
         hint = "continue it with resume=true or choose" if holds_run else "choose"
         raise ValueError(f"out_dir: {folder} already holds another run or other files; {hint} a new folder")
     folder.mkdir(parents=True, exist_ok=True)
+    for path in folder.iterdir():
+        if path.is_symlink():  # a folder that somebody else made could have us write anywhere
+            raise ValueError(f"out_dir: {path} is a link; a run's folder holds files and folders of its own")
     with claimed(folder):
         for path in (folder, *(folder / name for name in OWN_FOLDERS)):
             remove_leftovers(path)

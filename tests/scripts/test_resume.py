@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -130,6 +131,18 @@ def test_what_cannot_be_continued_is_refused_in_one_line(whole: Path, arguments:
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert named in done.stderr
     assert {path: path.stat().st_mtime_ns for path in whole.parent.rglob("*")} == before
+
+
+def test_a_run_folder_with_links_is_not_written_to(tmp_path: Path, whole: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    shutil.copytree(whole, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    (tmp_path / "run" / "checkpoints").symlink_to(outside)
+    done = run_script("train", "out_dir=run", "resume=true", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "checkpoints is a link" in done.stderr
+    assert list(outside.iterdir()) == []
 
 
 def test_a_run_in_use_is_refused_and_lives_on(tmp_path: Path) -> None:
