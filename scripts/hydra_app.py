@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 import dnerf
 from dnerf.allocator import keep_freed_memory
 from dnerf.checkpoints import load_weights
-from dnerf.distributed import LostProcess
+from dnerf.distributed import LostProcess, is_launched
 from dnerf.renderer import Renderer
 from dnerf.scenes import SCENES
 from dnerf.stopping import TrainingStopped
@@ -151,19 +151,21 @@ def _check_target(target: str) -> None:
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device of a name; "auto" is CUDA where there is one.
+    """The device of a name; "auto" is CUDA where there is one. Under torchrun "cuda" is each process's own GPU.
 
     Raises:
         ValueError: for an unknown device or one that is not there.
     """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError as error:
         raise ValueError(f"device must be auto, cpu, cuda or cuda:<index>, got {name!r}") from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {name!r} was asked for, but torch sees no CUDA device")
+    if device.type == "cuda" and device.index is None and is_launched():
+        return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
     return device
 
 

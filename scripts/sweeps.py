@@ -72,6 +72,7 @@ def begin_job() -> None:
 
 def record_failure(error: BaseException) -> None:
     """Keep a failed job's traceback in the sweep's folder."""
+    SweepWatch.folder = SweepWatch.folder or sweep_folder()
     write_text(_error_path(), "".join(traceback.format_exception(error)))
 
 

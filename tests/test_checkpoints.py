@@ -92,6 +92,28 @@ def test_truncated_file_is_refused(checkpoint: Path, share: float) -> None:
     assert_refused(Model(), checkpoint, "not a readable safetensors file")
 
 
+@pytest.mark.parametrize("place", [-1, -100, -700])
+def test_a_flipped_byte_among_the_numbers_is_noticed(checkpoint: Path, place: int) -> None:
+    data = bytearray(checkpoint.read_bytes())
+    data[place] ^= 0x10
+    checkpoint.write_bytes(data)
+    assert_refused(Model(), checkpoint, "damaged: its contents do not match their digest")
+
+
+def test_a_file_larger_than_the_model_is_not_read(checkpoint: Path) -> None:
+    with checkpoint.open("r+b") as file:
+        file.truncate(2**40)  # sparse
+    assert_refused(Model(), checkpoint, r"does not fit its config: at most \d+ bytes, got 1099511627776")
+
+
+def test_weights_of_another_origin_have_no_digest_and_are_read(checkpoint: Path) -> None:
+    tensors = load_file(checkpoint)
+    save_file({name: value + 1 for name, value in tensors.items()}, checkpoint)
+    model = Model()
+    load_weights(model, checkpoint)
+    assert all(torch.equal(tensors[name] + 1, value) for name, value in model.state_dict().items())
+
+
 def with_header(header: bytes) -> bytes:
     return struct.pack("<Q", len(header)) + header
 
