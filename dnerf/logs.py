@@ -1,6 +1,9 @@
 """Logs of a training run: JSON lines, preview pictures, TensorBoard."""
 
+import errno
 import json
+import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +11,7 @@ from torch import nn
 
 from dnerf.data.frames import Frames
 from dnerf.evaluation import evaluate
+from dnerf.files import write_text
 from dnerf.renderer import Renderer
 from dnerf.training import TrainingRecord
 from dnerf.video import contact_sheet, error_map, write_png
@@ -18,18 +22,45 @@ SHEET_COLUMNS = ("prediction", "truth", "error (yellow: 0.2 or more)")
 class JsonLinesLog:
     """Appends every training record to a file, one JSON object a line, flushed at once.
 
+    The first record of a continued run replaces those of the same step and later ones, which an earlier process
+    wrote after its last checkpoint. No line is left half written.
+
     Args:
         path: the file; made if it is not there.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
+        self._is_trimmed = False
 
     def __call__(self, record: TrainingRecord, renderer: nn.Module) -> None:
         """Append a record."""
+        if not self._is_trimmed:
+            self._trim(record.step)
         values = {**vars(record), "losses": dict(record.losses)}
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(values) + "\n")
+        line = (json.dumps(values) + "\n").encode()
+        with self.path.open("ab", buffering=0) as file:
+            size = file.seek(0, os.SEEK_END)
+            try:
+                if file.write(line) != len(line):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+            except OSError:
+                file.truncate(size)
+                raise
+
+    def _trim(self, step: int) -> None:
+        if self.path.exists():
+            lines = self.path.read_text(encoding="utf-8", errors="replace").splitlines()
+            write_text(self.path, "".join(f"{line}\n" for line in lines if _step_of(line) < step))
+        self._is_trimmed = True
+
+
+def _step_of(line: str) -> float:
+    """The step of a line; infinite if the line is broken."""
+    try:
+        return float(json.loads(line)["step"])
+    except (ValueError, KeyError, TypeError):
+        return math.inf
 
 
 class Previews:
@@ -47,7 +78,9 @@ class Previews:
         self.frames = frames
         self.every = every
         self.writer = writer
-        self._next = every
+        # A continued run goes on after the pictures that are there.
+        steps = [int(path.stem.partition("_")[2]) for path in self.folder.glob("step_*.png")]
+        self._next = max(steps, default=0) + every
 
     def __call__(self, record: TrainingRecord, renderer: Renderer) -> None:
         """Render the preview if `every` steps have passed since the last."""

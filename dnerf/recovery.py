@@ -22,6 +22,24 @@ from dnerf.compositing import Rendering
 logger = logging.getLogger(__name__)
 
 
+SHOWN = ("mean opacity", "mean contrast")
+
+
+def what_is_shown(rendering: Rendering, target: Tensor) -> dict[str, Tensor]:
+    """How much a batch shows and ought to show; nothing is computed that waits for a device.
+
+    Args:
+        rendering: of the batch, with its background.
+        target: (R, 3) true colours on the same background.
+
+    Returns:
+        Two scalars named as in `SHOWN`: mean opacity, and mean largest difference of the truth from the background.
+    """
+    background = 0.0 if rendering.background is None else rendering.background
+    contrast = (target - background).detach().abs().amax(-1).mean()
+    return dict(zip(SHOWN, (rendering.opacity.detach().mean(), contrast), strict=True))
+
+
 @dataclass(frozen=True)
 class Failure:
     """What went wrong.
@@ -76,32 +94,26 @@ class Recovery:
         self.min_opacity = min_opacity
         self.begin()
 
-    def begin(self) -> None:
-        """Forget earlier runs."""
+    def begin(self, rollbacks: int = 0) -> None:
+        """Forget earlier runs; `rollbacks` counts those of a run that is continued."""
+        self.rollbacks = rollbacks
         self.failures: list[Failure] = []
         self._good: tuple[int, dict[str, Tensor], dict[str, Any]] | None = None
         self._empty: deque[bool] = deque(maxlen=self.patience)
-        self._shown: tuple[Tensor, Tensor] | None = None
         self._step_kept = -self.keep_every
 
     @property
     def factor(self) -> float:
         """On the learning rates, after the rollbacks so far."""
-        return self.learning_rate_factor ** len(self.failures)
-
-    def observe(self, rendering: Rendering, target: Tensor) -> None:
-        """Note how much a batch shows; nothing is computed that waits for a device.
-
-        Args:
-            rendering: of the batch, with its background.
-            target: (R, 3) true colours on the same background.
-        """
-        opacity = rendering.opacity.detach().mean()
-        background = 0.0 if rendering.background is None else rendering.background
-        self._shown = opacity, (target - background).detach().abs().amax(-1).mean()
+        return self.learning_rate_factor**self.rollbacks
 
     def check(
-        self, step: int, model: nn.Module, optimizer: torch.optim.Optimizer, losses: Mapping[str, float]
+        self,
+        step: int,
+        model: nn.Module,
+        optimizer: torch.optim.Optimizer,
+        losses: Mapping[str, float],
+        shown: Mapping[str, float] | None = None,
     ) -> Failure | None:
         """Look at a record of the run: keep its state if it is healthy, roll it back if it is not.
 
@@ -110,6 +122,7 @@ class Recovery:
             model: in training.
             optimizer: of its parameters.
             losses: of the step, by name.
+            shown: of the step, as numbers, see `what_is_shown`; collapses go unnoticed without.
 
         Returns:
             What went wrong, if the state was rolled back; None if all is well.
@@ -117,16 +130,17 @@ class Recovery:
         Raises:
             FloatingPointError: if something went wrong and no rollback is left.
         """
-        failure = self._find(step, model, losses)
+        failure = self._find(step, model, losses, shown)
         if failure is None:
             # A batch that shows nothing may be the first of a collapse.
             if step - self._step_kept >= self.keep_every and not any(self._empty):
                 self._good = (step, _copied(model.state_dict()), copy.deepcopy(optimizer.state_dict()))
                 self._step_kept = step
             return None
-        if self._good is None or len(self.failures) >= self.max_rollbacks:
-            raise FloatingPointError(f"{failure}; {len(self.failures)} rollbacks did not help")
+        if self._good is None or self.rollbacks >= self.max_rollbacks:
+            raise FloatingPointError(f"{failure}; {self.rollbacks} rollbacks did not help")
         self.failures.append(failure)
+        self.rollbacks += 1
         good_step, weights, moments = self._good
         model.load_state_dict(weights)
         optimizer.load_state_dict(copy.deepcopy(moments))
@@ -134,11 +148,13 @@ class Recovery:
         self._step_kept = step
         logger.warning(
             "%s; back to the state of step %d, learning rates now %.3g of the schedule's (rollback %d of %d)",
-            failure, good_step, self.factor, len(self.failures), self.max_rollbacks,
+            failure, good_step, self.factor, self.rollbacks, self.max_rollbacks,
         )  # fmt: skip
         return failure
 
-    def _find(self, step: int, model: nn.Module, losses: Mapping[str, float]) -> Failure | None:
+    def _find(
+        self, step: int, model: nn.Module, losses: Mapping[str, float], shown: Mapping[str, float] | None
+    ) -> Failure | None:
         broken = [name for name, value in losses.items() if not math.isfinite(value)]
         parameters = [name for name, p in model.named_parameters() if not bool(torch.isfinite(p).all())]
         gradients = [
@@ -148,9 +164,9 @@ class Recovery:
         ]
         if parameters or broken or gradients:
             return Failure(step, _describe(broken, parameters, gradients), _cause(parameters, gradients))
-        if self._shown is None:
+        if not shown:
             return None
-        opacity, contrast = (float(value) for value in self._shown)
+        opacity, contrast = (shown[name] for name in SHOWN)
         self._empty.append(opacity < self.min_opacity and contrast > 10 * self.min_opacity)
         if len(self._empty) == self.patience and all(self._empty):
             return Failure(

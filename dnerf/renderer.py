@@ -1,5 +1,7 @@
 """The renderer: rays -> sampler -> field -> composite. It is the whole trainable model."""
 
+import logging
+from collections.abc import Iterator
 from itertools import chain
 
 import torch
@@ -14,6 +16,8 @@ from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 from dnerf.samplers.visibility import walk_front_to_back
+
+logger = logging.getLogger(__name__)
 
 PAD_TO = 2048  # samples; see `Samples.padded`
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
@@ -141,6 +145,7 @@ class Renderer(nn.Module):
 
         Raises:
             ValueError: for a time outside [0, 1] or a chunk that is not positive.
+            MemoryError: if a GPU's memory does not suffice for one ray; until then the chunk is halved.
         """
         check_positive("chunk", chunk)
         if not 0 <= time <= 1:
@@ -149,7 +154,7 @@ class Renderer(nn.Module):
         modes = [(module, module.training) for module in self.modules()]
         self.eval()
         try:
-            parts = [self._without_gradients(rays[i : i + chunk]) for i in range(0, len(rays), chunk)]
+            parts = list(self._in_chunks(rays, chunk))
         finally:
             for module, mode in modes:
                 module.training = mode
@@ -159,3 +164,18 @@ class Renderer(nn.Module):
             opacity=torch.cat([p.opacity for p in parts]).reshape(shape),
             depth=torch.cat([p.depth for p in parts]).reshape(shape),
         )
+
+    def _in_chunks(self, rays: Rays, chunk: int) -> Iterator[Rendering]:
+        """Render so many rays at a time; half as many from where a GPU's memory does not suffice."""
+        start = 0
+        while start < len(rays):
+            try:
+                part = self._without_gradients(rays[start : start + chunk])
+            except torch.OutOfMemoryError as error:
+                if chunk == 1:
+                    raise MemoryError("the GPU's memory does not suffice for one ray") from error
+                chunk //= 2
+                logger.warning("the GPU's memory does not suffice: going on with chunk=%d", chunk)
+                continue
+            start += chunk
+            yield part

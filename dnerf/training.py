@@ -3,47 +3,29 @@
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from signal import Signals
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
 from dnerf.checks import check_choice, check_positive
 from dnerf.data.frames import Frames, composite_on
+from dnerf.distributed import Processes
 from dnerf.losses import Loss, PhotometricLoss
-from dnerf.recovery import Recovery
+from dnerf.records import Outcome, TrainingRecord, check_finite, psnr_of, show
+from dnerf.recovery import SHOWN, Recovery, what_is_shown
 from dnerf.renderer import Renderer
+from dnerf.run_state import CheckpointFolder, RunState, fingerprint, max_bytes
+from dnerf.stopping import StopRequest, TrainingStopped, stop_requests
 
 logger = logging.getLogger(__name__)
 
 BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
 SCHEDULES = ("exponential", "cosine", "constant")
-
-
-@dataclass(frozen=True)
-class TrainingRecord:
-    """What one step of training looked like.
-
-    Args:
-        step: number of steps done, this one included.
-        seconds: time spent training so far, callbacks and data loading left out.
-        losses: each loss term by name; "loss" is their sum.
-        psnr: of the batch's colours, in dB.
-        num_rays: rays of the batch.
-        num_samples: field evaluations of the batch.
-        learning_rate_factor: of the schedule, in [0, 1].
-    """
-
-    step: int
-    seconds: float
-    losses: Mapping[str, float]
-    psnr: float
-    num_rays: int
-    num_samples: int
-    learning_rate_factor: float
 
 
 Callback = Callable[[TrainingRecord, Renderer], None]
@@ -71,6 +53,7 @@ class Trainer:
         epsilon: Adam's epsilon.
         losses: terms by name; the photometric loss if None.
         log_every: steps between records.
+        checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
         recovery: brings a run back that goes to NaN or collapses; None lets it end with an error.
 
@@ -94,6 +77,7 @@ class Trainer:
         epsilon: float = 1e-8,
         losses: Mapping[str, Loss] | None = None,
         log_every: int = 20,
+        checkpoint_every: int | None = 1000,
         progress_bar: bool = True,
         recovery: Recovery | None = None,
     ) -> None:
@@ -103,6 +87,7 @@ class Trainer:
             ("max_rays", max_rays),
             ("final_learning_rate", final_learning_rate),
             ("log_every", log_every),
+            ("checkpoint_every", 1 if checkpoint_every is None else checkpoint_every),
             ("max_seconds", 1 if max_seconds is None else max_seconds),
             ("target_samples", 1 if target_samples is None else target_samples),
         ):
@@ -123,69 +108,121 @@ class Trainer:
         self.epsilon = epsilon
         self.losses = nn.ModuleDict({"rgb": PhotometricLoss()} if losses is None else dict(losses))
         self.log_every = log_every
+        self.checkpoint_every = checkpoint_every
         self.progress_bar = progress_bar
         self.recovery = recovery
 
     def fit(
-        self, renderer: Renderer, frames: Frames, *, seed: int = 0, callbacks: Sequence[Callback] = ()
+        self,
+        renderer: Renderer,
+        frames: Frames,
+        *,
+        seed: int = 0,
+        callbacks: Sequence[Callback] = (),
+        checkpoints: CheckpointFolder | None = None,
+        resume: bool = False,
+        processes: Processes | None = None,
     ) -> TrainingRecord:
         """Train in place.
+
+        With `checkpoints`, SIGTERM and SIGINT end training after the step they find, its state saved.
 
         Args:
             renderer: the model, on the device where training happens.
             frames: pictures, cameras and times; moved to the model's device.
             seed: of the random rays, points and backgrounds.
-            callbacks: called with every record, the clock stopped.
+            callbacks: called with every record, the clock stopped; in the first process only.
+            checkpoints: where states are written every `checkpoint_every` steps and at the end, or None.
+            resume: continue from the newest checkpoint, if there is one, exactly as if training had never stopped.
+            processes: those that train together; None for this one alone.
 
         Returns:
             The last step's record.
 
         Raises:
             FloatingPointError: naming step and tensors, when the loss is not finite.
-            ValueError: if frames have no alpha but a random background needs it.
+            ValueError: if frames have no alpha but a random background needs it, or a checkpoint does not fit.
+            TrainingStopped: after a signal.
+            MemoryError: saying what to lower, when a GPU's memory does not suffice.
+            OSError: if the last checkpoint cannot be written; for earlier ones a warning is logged.
         """
         if isinstance(renderer.background, RandomBackground) and not frames.has_alpha:
             raise ValueError("background: a random one needs frames with alpha, these have none")
-        device = renderer.device
-        frames = frames.to(device)
-        generator = torch.Generator(device).manual_seed(seed)
-        optimizer = self._optimizer(renderer)
-        base_rates = [group["lr"] for group in optimizer.param_groups]
-        num_rays, seconds, step, progress, rays_done = self.num_rays, 0.0, 0, 0.0, 0
-        if self.recovery is not None:
-            self.recovery.begin()
+        processes = processes or Processes()
+        frames = frames.to(renderer.device)
+        generator = torch.Generator(renderer.device).manual_seed(seed)
+        modules = {"renderer": renderer, "losses": self.losses}
+        run = RunState(modules, self._optimizer(renderer), generator, max(self.num_rays, processes.size))
+        if checkpoints is not None:
+            run.data = fingerprint(frames)
         renderer.train()
         self._warm_up(renderer, frames)
-        with tqdm(total=100, disable=not self.progress_bar, dynamic_ncols=True, bar_format=BAR) as bar:
-            while True:
-                begin = time.perf_counter()
-                renderer.set_progress(progress)
-                factor = self._learning_rate_factor(progress, step)
-                for group, rate in zip(optimizer.param_groups, base_rates):
-                    group["lr"] = rate * factor * (1.0 if self.recovery is None else self.recovery.factor)
-                renderer.update(step)
-                terms, num_samples, mse = self._step(renderer, frames, optimizer, num_rays, generator)
-                step += 1
-                used_rays, num_rays = num_rays, self._next_num_rays(num_rays, num_samples)
-                rays_done += used_rays
-                done = step >= self.num_steps
-                is_record = step == 1 or step % self.log_every == 0
-                seconds += time.perf_counter() - begin
-                done = done or (self.max_seconds is not None and seconds >= self.max_seconds)
-                progress = self._progress(step, seconds)
-                if is_record or done:
-                    values = {name: float(term) for name, term in terms.items()}
-                    record = TrainingRecord(step, seconds, values, _psnr(float(mse)), used_rays, num_samples, factor)
-                    failed = self.recovery is not None and self.recovery.check(step, renderer, optimizer, values)
-                    if not failed:
-                        _check_finite(values, step, renderer)
-                        for callback in callbacks:
-                            callback(record, renderer)
-                        _show(bar, record, progress, rays_done)
-                if done:
-                    break
+        if resume and checkpoints is not None:
+            self._restore(run, checkpoints, processes)
+        if self.recovery is not None:
+            self.recovery.begin(run.rollbacks)
+        catching = nullcontext(StopRequest()) if checkpoints is None else stop_requests()
+        is_shown = self.progress_bar and processes.is_first
+        bar = tqdm(total=100, disable=not is_shown, dynamic_ncols=True, bar_format=BAR)
+        with bar, catching as request, processes.watched(), _advice_on_memory(run):
+            self._loop(run, renderer, frames, processes, callbacks, checkpoints, request, bar)
         renderer.set_progress(1.0)
         renderer.eval()
+        assert run.record is not None
+        return TrainingRecord(**run.record)
+
+    def _loop(
+        self,
+        run: RunState,
+        renderer: Renderer,
+        frames: Frames,
+        processes: Processes,
+        callbacks: Sequence[Callback],
+        checkpoints: CheckpointFolder | None,
+        request: StopRequest,
+        bar: tqdm,
+    ) -> None:
+        """Steps, records and checkpoints until the end or a signal; every process takes the same turns."""
+        model = processes.wrap(renderer)
+        while not self._is_finished(run):
+            begin = time.perf_counter()
+            outcome = self._step(run, model, frames, processes)
+            seconds = run.seconds + time.perf_counter() - begin
+            run.seconds, num_samples, signal = processes.agree(seconds, outcome.num_samples, request.number)
+            run.step += 1
+            used_rays, wanted_rays = run.num_rays, self._next_num_rays(run.num_rays, num_samples)
+            run.rays_done, run.num_rays = run.rays_done + used_rays, max(wanted_rays, processes.size)
+            ends = self._is_finished(run)
+            saves = checkpoints is not None and bool(ends or signal or self._is_due(run.step))
+            # What is saved has been looked at.
+            if saves or run.step == 1 or ends or run.step % self.log_every == 0:
+                record = self._examined(run, outcome, processes, used_rays, num_samples)
+                if record is not None and processes.is_first:
+                    _report(record, renderer, callbacks)
+                    show(bar, record, self._progress(run), run.rays_done)
+            if checkpoints is not None and saves:
+                processes.merge_observations(renderer)
+                if processes.is_first:
+                    checkpoints.save(run, must_succeed=bool(ends or signal))
+            if signal and not ends:
+                raise TrainingStopped(signal, f"stopped by {Signals(signal).name} after step {run.step}, all saved")
+
+    def _examined(
+        self, run: RunState, outcome: Outcome, processes: Processes, used_rays: int, num_samples: int
+    ) -> TrainingRecord | None:
+        """The record of a step, or None if the run was broken and has been brought back."""
+        numbers, renderer = processes.mean(outcome.numbers()), run.modules["renderer"]
+        assert isinstance(renderer, Renderer)
+        psnr = psnr_of(numbers.pop("mse"))
+        shown = {name: numbers.pop(name) for name in SHOWN if name in numbers}
+        if self.recovery is not None and self.recovery.check(run.step, renderer, run.optimizer, numbers, shown):
+            run.rollbacks += 1
+            return None
+        check_finite(numbers, run.step, renderer)
+        record = TrainingRecord(
+            run.step, run.seconds, numbers, psnr, used_rays, num_samples, outcome.learning_rate_factor
+        )
+        run.record = vars(record)
         return record
 
     def _warm_up(self, renderer: Renderer, frames: Frames) -> None:
@@ -200,38 +237,44 @@ class Trainer:
             loss.backward()
         renderer.zero_grad(set_to_none=True)
 
-    def _step(
-        self,
-        renderer: Renderer,
-        frames: Frames,
-        optimizer: torch.optim.Optimizer,
-        num_rays: int,
-        generator: torch.Generator,
-    ) -> tuple[dict[str, Tensor], int, Tensor]:
+    def _step(self, run: RunState, model: nn.Module, frames: Frames, processes: Processes) -> Outcome:
+        """One optimiser step on this process's share of a random batch."""
+        renderer, progress = run.modules["renderer"], self._progress(run)
+        assert isinstance(renderer, Renderer)
+        renderer.set_progress(progress)
+        factor = self._learning_rate_factor(progress, run.step)
+        for group in run.optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * factor * (1.0 if self.recovery is None else self.recovery.factor)
+        processes.merge_observations(renderer, run.step)
+        renderer.update(run.step)
+        generator, num_rays, share = run.generator, run.num_rays, processes.share(run.num_rays)
         indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)
-        rays, rgba = frames.pixels(indices)
-        rendering = renderer(rays, generator=generator)
+        rays, rgba = frames.pixels(indices[share])
+        with processes.same_randomness(generator, num_rays):
+            rendering = model(rays, generator=generator)
         assert rendering.background is not None
         assert rendering.samples is not None
         target = composite_on(rgba, rendering.background)
-        if self.recovery is not None:
-            self.recovery.observe(rendering, target)
         terms = {name: loss(rendering, target, renderer) for name, loss in self.losses.items()}
         total = torch.stack(list(terms.values())).sum()
-        optimizer.zero_grad(set_to_none=True)
+        run.optimizer.zero_grad(set_to_none=True)
+        # Shares may differ by a ray: weighted so, their mean is that over all rays.
+        weight = len(rays) * processes.size / num_rays
         if total.requires_grad:
-            total.backward()
-            optimizer.step()
+            (total * weight if weight != 1 else total).backward()
+            run.optimizer.step()
         mse = (rendering.rgb.detach() - target).square().mean()
-        detached = {name: term.detach() for name, term in terms.items()}
-        return {"loss": total.detach(), **detached}, rendering.samples.starts.numel(), mse
+        shown = {} if self.recovery is None else what_is_shown(rendering, target)
+        detached = {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse, **shown}.items()}
+        return Outcome(detached, weight, rendering.samples.starts.numel(), factor)
 
     def _optimizer(self, renderer: Renderer) -> torch.optim.Optimizer:
         groups: dict[str, list[nn.Parameter]] = {prefix: [] for prefix in self.learning_rates}
         for name, parameter in renderer.named_parameters():
             prefix = max((p for p in groups if name.startswith(p)), key=len)
             groups[prefix].append(parameter)
-        listed = [{"params": parameters, "lr": self.learning_rates[prefix]} for prefix, parameters in groups.items()]
+        rates = self.learning_rates
+        listed = [{"params": group, "lr": rates[name], "initial_lr": rates[name]} for name, group in groups.items()]
         return torch.optim.Adam([g for g in listed if g["params"]], betas=self.betas, eps=self.epsilon, fused=True)
 
     def _next_num_rays(self, num_rays: int, num_samples: int) -> int:
@@ -240,9 +283,22 @@ class Trainer:
         wanted = num_rays * self.target_samples / max(num_samples, 1)
         return int(min(max(wanted, num_rays / 2, 1), num_rays * 2, self.max_rays))
 
-    def _progress(self, step: int, seconds: float) -> float:
-        of_time = 0.0 if self.max_seconds is None else seconds / self.max_seconds
-        return min(max(step / self.num_steps, of_time), 1.0)
+    def _restore(self, run: RunState, checkpoints: CheckpointFolder, processes: Processes) -> None:
+        data = processes.from_first(lambda: checkpoints.read(max_bytes(run.modules)))
+        if data is not None:
+            run.restore(data, checkpoints.folder, max_rays=max(self.num_rays, self.max_rays))
+            run.num_rays = max(run.num_rays, processes.size)
+            logger.info("continuing after step %d", run.step)
+
+    def _is_finished(self, run: RunState) -> bool:
+        return run.step >= self.num_steps or (self.max_seconds is not None and run.seconds >= self.max_seconds)
+
+    def _is_due(self, step: int) -> bool:
+        return self.checkpoint_every is not None and step % self.checkpoint_every == 0
+
+    def _progress(self, run: RunState) -> float:
+        of_time = 0.0 if self.max_seconds is None else run.seconds / self.max_seconds
+        return min(max(run.step / self.num_steps, of_time), 1.0)
 
     def _learning_rate_factor(self, progress: float, step: int) -> float:
         warmup = min(1.0, (step + 1) / (self.warmup_steps + 1))
@@ -254,24 +310,22 @@ class Trainer:
         return warmup
 
 
-def _show(bar: tqdm, record: TrainingRecord, progress: float, rays_done: int) -> None:
-    remaining = record.seconds * (1 - progress) / max(progress, 1e-9)
-    bar.n = round(100 * progress, 1)
-    bar.set_postfix_str(
-        f"step {record.step:,}, loss {record.losses['loss']:.4f}, PSNR {record.psnr:.2f} dB, "
-        f"{rays_done / record.seconds:,.0f} rays/s, ETA {remaining:.0f} s"
-    )
+def _report(record: TrainingRecord, renderer: Renderer, callbacks: Sequence[Callback]) -> None:
+    """Call the callbacks; one that cannot write (a full disk) costs its output, not the run."""
+    for callback in callbacks:
+        try:
+            callback(record, renderer)
+        except OSError as error:
+            logger.warning("step %d: %s failed: %s", record.step, type(callback).__name__, error)
 
 
-def _psnr(mse: float) -> float:
-    return -10 * math.log10(max(mse, 1e-12))
-
-
-def _check_finite(values: Mapping[str, float], step: int, renderer: nn.Module) -> None:
-    if all(math.isfinite(value) for value in values.values()):
-        return
-    broken = [name for name, value in values.items() if not math.isfinite(value)]
-    parameters = [name for name, p in renderer.named_parameters() if not bool(torch.isfinite(p).all())]
-    raise FloatingPointError(
-        f"step {step}: {', '.join(broken)} not finite; parameters not finite: {', '.join(parameters) or 'none'}"
-    )
+@contextmanager
+def _advice_on_memory(run: RunState) -> Iterator[None]:
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise MemoryError(
+            f"step {run.step + 1}: the GPU's memory does not suffice for {run.num_rays} rays; lower trainer.num_rays, "
+            "trainer.target_samples or trainer.max_rays, or set renderer.precision=bfloat16; a checkpoint, if there "
+            f"is one, is good ({' '.join(str(error).split())[:120]})"
+        ) from error

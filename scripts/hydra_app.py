@@ -1,16 +1,20 @@
-"""What the scripts share: Hydra entry points with one-line errors, objects from configs, run folders."""
+"""What the scripts share: Hydra entry points with one-line errors, objects from configs, saved configs."""
 
 import importlib
 import os
+import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import hydra
+import sweeps
 import torch
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -20,9 +24,15 @@ from omegaconf.errors import OmegaConfBaseException
 import dnerf
 from dnerf.allocator import keep_freed_memory
 from dnerf.checkpoints import load_weights
-from dnerf.files import write_text
+from dnerf.distributed import LostProcess, is_launched
 from dnerf.renderer import Renderer
 from dnerf.scenes import SCENES
+from dnerf.stopping import TrainingStopped
+
+WRONG_INPUT = 2
+USER_ERRORS = (ValueError, OSError, MemoryError, LostProcess, HydraException, OmegaConfBaseException)
+MAX_CONFIG_BYTES = 64 * 1024
+MAX_CONFIG_DEPTH = 40
 
 CONF = str(Path(__file__).resolve().parents[1] / "conf")
 
@@ -30,27 +40,78 @@ CONF = str(Path(__file__).resolve().parents[1] / "conf")
 def run_app(main: Callable[[DictConfig], None], config_name: str) -> None:
     """Run a Hydra application; what the user got wrong ends in one line on standard error and exit code 2.
 
-    Also sets the C allocator to keep memory between steps. Set DNERF_TRACEBACK=1 to see the whole traceback instead.
+    In a multirun a job that fails leaves the others alone; at the end the exit code is 2 if one has failed. SIGINT
+    and SIGTERM end with 130 and 143. Also sets the C allocator to keep memory between steps. Set DNERF_TRACEBACK=1 to
+    see the whole traceback instead.
     """
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    _tell_workers_where_we_are()
     keep_freed_memory()
     with _one_line_errors():
-        hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(_one_line_errors()(main))()
+        hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(_as_job(main))()
+        sweeps.finish()
+
+
+def _as_job(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """One job: its errors are caught here, before Hydra adds lines or, in a multirun, stops the sweep."""
+
+    def job(config: DictConfig) -> None:
+        if HydraConfig.get().mode == RunMode.RUN:
+            with _one_line_errors():
+                main(config)
+            return
+        try:
+            with _one_line_errors():
+                sweeps.begin_job()
+                main(config)
+        except SystemExit as end:
+            if end.code != WRONG_INPUT:
+                raise
+            sweeps.record_failure(end.__context__ or end)
+        # A defect of the program, too, is this job's alone.
+        except Exception as error:  # noqa: BLE001
+            traceback.print_exc()
+            sweeps.record_failure(error)
+
+    return job
 
 
 @contextmanager
 def _one_line_errors() -> Iterator[None]:
-    """Leave with one line and exit code 2 on what the user got wrong (within a job, before Hydra adds lines)."""
+    """Leave with one line and an exit code that says what happened: wrong input, or a signal to stop."""
     try:
         yield
-    except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
+    except TrainingStopped as stop:
+        if int(os.environ.get("RANK", "0")) == 0:
+            print(f"{stop}; continue with resume=true", file=sys.stderr)
+        sys.exit(stop.exit_code)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)
+    except USER_ERRORS as error:
         if os.environ.get("DNERF_TRACEBACK") == "1":
             raise
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        rank = os.environ.get("RANK", "0")
+        print(f"error: {f'process {rank}: ' if rank != '0' else ''}{one_line(error)}", file=sys.stderr)
+        sys.exit(WRONG_INPUT)
+    except BrokenProcessPool as error:
+        print(
+            f"error: a worker of the sweep was killed ({one_line(error)[:200]}); the same command with resume=true "
+            "runs what is missing",
+            file=sys.stderr,
+        )
+        sys.exit(WRONG_INPUT)
 
 
-def _one_line(error: BaseException) -> str:
+def _tell_workers_where_we_are() -> None:
+    """Let the processes that launchers start find the scripts and the package, wherever they begin."""
+    known = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    wanted = [str(Path(__file__).resolve().parent), str(Path(dnerf.__file__).resolve().parents[1])]
+    os.environ["PYTHONPATH"] = os.pathsep.join(wanted + [path for path in known if path and path not in wanted])
+
+
+def one_line(error: BaseException) -> str:
+    """An error's message on one line, of its cause where Hydra wraps it."""
     while isinstance(error, HydraException) and error.__cause__ is not None:
         error = error.__cause__
     return " ".join(line.strip() for line in str(error).splitlines() if line.strip())
@@ -90,40 +151,22 @@ def _check_target(target: str) -> None:
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device of a name; "auto" is CUDA where there is one.
+    """The device of a name; "auto" is CUDA where there is one. Under torchrun "cuda" is each process's own GPU.
 
     Raises:
         ValueError: for an unknown device or one that is not there.
     """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError as error:
         raise ValueError(f"device must be auto, cpu, cuda or cuda:<index>, got {name!r}") from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {name!r} was asked for, but torch sees no CUDA device")
+    if device.type == "cuda" and device.index is None and is_launched():
+        return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
     return device
-
-
-def new_run_folder(config: DictConfig) -> Path:
-    """Make the folder of a new run and save the resolved config in it.
-
-    In a multirun every job gets its own folder below `out_dir`, named by its overrides.
-
-    Raises:
-        ValueError: if the folder holds another run.
-    """
-    choice = HydraConfig.get().runtime.choices.get("experiment") or "run"
-    stamp = datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
-    folder = Path(config.out_dir or f"runs/{choice}-{stamp}")
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
-        folder = folder / (HydraConfig.get().job.override_dirname or str(HydraConfig.get().job.num))
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"out_dir: {folder} already holds another run or other files; choose a new folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-    return folder
 
 
 def load_config(run: str) -> DictConfig:
@@ -136,10 +179,12 @@ def load_config(run: str) -> DictConfig:
     if not path.is_file():
         raise ValueError(f"run: {path} does not exist; {run} is not the folder of a run")
     try:
-        config = OmegaConf.load(path)
+        value = _plain_yaml(path)
+        config = OmegaConf.create(value)
     except Exception as error:
-        raise ValueError(f"{path}: not a readable config ({_one_line(error)})") from error
-    if not isinstance(config, DictConfig) or "renderer" not in config or "data" not in config:
+        raise ValueError(f"{path}: not a readable config ({one_line(error)})") from error
+    groups = [value.get(name) if isinstance(value, dict) else None for name in ("renderer", "data")]
+    if not isinstance(config, DictConfig) or not all(isinstance(group, dict) for group in groups):
         raise ValueError(f"{path}: expected a mapping with renderer and data, not the config of a run")
     container = OmegaConf.to_container(config, resolve=False)
     if "${" in str(container):
@@ -149,6 +194,21 @@ def load_config(run: str) -> DictConfig:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return config
+
+
+def _plain_yaml(path: Path) -> Any:
+    """The value of a small YAML file, neither deep nor with references, which could unfold without bound."""
+    with path.open("rb") as file:
+        data = file.read(MAX_CONFIG_BYTES + 1)
+    if len(data) > MAX_CONFIG_BYTES:
+        raise ValueError(f"more than {MAX_CONFIG_BYTES} bytes")
+    text, depth = data.decode(), 0
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    for event in yaml.parse(text, loader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_CONFIG_DEPTH or isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"aliases and more than {MAX_CONFIG_DEPTH} levels are not supported")
+    return yaml.load(text, loader)
 
 
 def load_renderer(run: str, config: DictConfig, device: torch.device) -> Renderer:

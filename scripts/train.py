@@ -1,34 +1,63 @@
 """Train a model: python scripts/train.py experiment=demo [data=blender data.root=... out_dir=... key=value ...]"""
 
+import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import torch
-from hydra_app import build, new_run_folder, resolve_device, run_app
-from omegaconf import DictConfig
+from hydra_app import build, resolve_device, run_app
+from omegaconf import DictConfig, OmegaConf
 from reporting import evaluate_run, print_scores
+from run_folder import continued, opened
 
 from dnerf.checkpoints import save_weights
+from dnerf.distributed import Processes, started
 from dnerf.files import write_json
 from dnerf.logs import JsonLinesLog, Previews, TensorBoardLog, tensorboard_writer
 from dnerf.provenance import commit, hardware
+from dnerf.run_state import CheckpointFolder
 
 
 def main(config: DictConfig) -> None:
-    """Build data, model and trainer; train; save weights, logs and scores in the run's folder."""
+    """Train, alone or as one of the processes that torchrun started."""
     device = resolve_device(config.device)
+    with started(device, config.process_timeout) as processes, ExitStack() as held:
+        settings = processes.from_first(lambda: OmegaConf.to_yaml(continued(config), resolve=True).encode())
+        assert settings is not None
+        agreed = OmegaConf.create(settings.decode())
+        assert isinstance(agreed, DictConfig)
+        train(agreed, config.resume, device, processes, held)
+
+
+def train(config: DictConfig, resume: bool, device: torch.device, processes: Processes, held: ExitStack) -> None:
+    """Build data, model and trainer; train; save weights, logs and scores in the run's folder."""
     torch.manual_seed(config.seed)
     data = build(config.data)
     frames = data.frames("train")
     renderer = build(config.renderer).to(device)
     trainer = build(config.trainer)
     num_parameters = sum(p.numel() for p in renderer.parameters())
-    folder = new_run_folder(config)
-    size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
-    print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {device}")
-    with_writer = tensorboard_writer(folder / "tensorboard") if config.tensorboard else None
-    record = trainer.fit(renderer, frames, seed=config.seed, callbacks=_callbacks(config, folder, data, with_writer))
+    name = processes.from_first(lambda: str(held.enter_context(opened(config))).encode())
+    assert name is not None
+    folder = Path(name.decode())
+    callbacks: list[Callable[..., None]] = []
+    if processes.is_first:
+        size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
+        print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {device}")
+        callbacks = _callbacks(config, folder, data, held)
+    record = trainer.fit(
+        renderer,
+        frames,
+        seed=config.seed,
+        callbacks=callbacks,
+        checkpoints=CheckpointFolder(folder / "checkpoints"),
+        resume=resume,
+        processes=processes,
+    )
+    if not processes.is_first:
+        return
     save_weights(renderer, folder / "model.safetensors")
     training = {
         "train_seconds": record.seconds,
@@ -38,9 +67,10 @@ def main(config: DictConfig) -> None:
         "train_hardware": hardware(),
         "train_commit": commit(),
     }
+    if resume and _is_scored(folder, config, training):
+        print(f"{folder}: finished before, nothing to do")
+        return
     write_json(folder / "training.json", training)
-    if with_writer is not None:
-        with_writer.close()
     if config.evaluate_split is not None:
         print_scores(
             evaluate_run(
@@ -50,9 +80,28 @@ def main(config: DictConfig) -> None:
         )
 
 
-def _callbacks(config: DictConfig, folder: Path, data: Any, writer: Any) -> list[Callable[..., None]]:
+def _is_scored(folder: Path, config: DictConfig, training: dict[str, Any]) -> bool:
+    """Whether the scores that this run would end with are there already."""
+    try:
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        known = json.loads((folder / "training.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    wanted = config.evaluate_frames
+    return (
+        known == training
+        and metrics["split"] == config.evaluate_split
+        and metrics["num_steps"] == training["num_steps"]
+        and (wanted is None or metrics["num_frames"] == wanted)
+    )
+
+
+def _callbacks(config: DictConfig, folder: Path, data: Any, held: ExitStack) -> list[Callable[..., None]]:
     callbacks: list[Callable[..., None]] = [JsonLinesLog(folder / "log.jsonl")]
-    if writer is not None:
+    writer = None
+    if config.tensorboard:
+        writer = tensorboard_writer(folder / "tensorboard")
+        held.callback(writer.close)
         callbacks.append(TensorBoardLog(writer))
     if config.preview_every:
         callbacks.append(Previews(folder / "previews", data.frames("val"), config.preview_every, writer))

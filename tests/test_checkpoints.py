@@ -92,6 +92,28 @@ def test_truncated_file_is_refused(checkpoint: Path, share: float) -> None:
     assert_refused(Model(), checkpoint, "not a readable safetensors file")
 
 
+@pytest.mark.parametrize("place", [-1, -100, -700])
+def test_a_flipped_byte_among_the_numbers_is_noticed(checkpoint: Path, place: int) -> None:
+    data = bytearray(checkpoint.read_bytes())
+    data[place] ^= 0x10
+    checkpoint.write_bytes(data)
+    assert_refused(Model(), checkpoint, "damaged: its contents do not match their digest")
+
+
+def test_a_file_larger_than_the_model_is_not_read(checkpoint: Path) -> None:
+    with checkpoint.open("r+b") as file:
+        file.truncate(2**40)  # sparse
+    assert_refused(Model(), checkpoint, r"does not fit its config: at most \d+ bytes, got 1099511627776")
+
+
+def test_weights_of_another_origin_have_no_digest_and_are_read(checkpoint: Path) -> None:
+    tensors = load_file(checkpoint)
+    save_file({name: value + 1 for name, value in tensors.items()}, checkpoint)
+    model = Model()
+    load_weights(model, checkpoint)
+    assert all(torch.equal(tensors[name] + 1, value) for name, value in model.state_dict().items())
+
+
 def with_header(header: bytes) -> bytes:
     return struct.pack("<Q", len(header)) + header
 
@@ -142,11 +164,11 @@ def test_weights_of_another_dtype_are_refused(checkpoint: Path) -> None:
 def test_failed_save_keeps_the_old_checkpoint(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = checkpoint.read_bytes()
 
-    def fail(tensors: dict, path: Path) -> None:
-        Path(path).write_bytes(b"half")
+    def fail(path: Path, data: bytes) -> int:
+        path.open("wb").write(data[: len(data) // 2])
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("dnerf.checkpoints.save_file", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(OSError, match="no space"):
         save_weights(Model(), checkpoint)
     assert checkpoint.read_bytes() == before

@@ -87,3 +87,9 @@ def test_script_configs_compose(script):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for path in names("path") if script == "render" else [None]:
             compose(script, [f"path={path}"] if path else [])
+
+
+@pytest.mark.parametrize("script", ["train", "evaluate", "render", "make_dataset"])
+def test_failed_jobs_of_a_multirun_are_noticed(script):
+    text = (CONF / f"{script}.yaml").read_text()
+    assert "_target_: sweeps.SweepWatch" in text

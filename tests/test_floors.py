@@ -18,6 +18,7 @@ FLOORS = {
     "mlp": 0,
     "provenance": 0,
     "rays": 0,
+    "stopping": 0,
     # 1: one ray at a time.
     "backgrounds": 1,
     "cameras": 1,
@@ -36,8 +37,9 @@ FLOORS = {
     "motion_losses": 6,
     "plots": 6,
     "protocols": 6,
-    "visualisation": 6,
+    "records": 6,
     "recovery": 6,
+    "visualisation": 6,
     # 7: whole runs.
     "checkpoints": 7,
     "consistency": 7,
@@ -45,6 +47,7 @@ FLOORS = {
     "evaluation": 7,
     "logs": 7,
     "report": 7,
+    "run_state": 7,
     "sequences": 7,
     "temporal_evaluation": 7,
     "tracks": 7,
@@ -73,6 +76,9 @@ WITHIN_A_FLOOR = {
     ("sequences", "logs"),
     ("sequences", "video"),
     ("temporal_evaluation", "evaluation"),
+    ("run_state", "checkpoints"),
+    ("training", "distributed"),
+    ("training", "run_state"),
 }
 
 ONLY_SCRIPTS_KNOW = {"hydra", "omegaconf"}

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from dnerf.compositing import Rendering
-from dnerf.recovery import Recovery
+from dnerf.recovery import Recovery, what_is_shown
 
 
 class Run:
@@ -31,10 +31,11 @@ class Run:
         return [x.clone() for x in [*self.model.state_dict().values(), *moments]]
 
 
-def batch(opacity: float, contrast: float) -> tuple[Rendering, torch.Tensor]:
+def batch(opacity: float, contrast: float) -> dict[str, float]:
     rays = torch.full((5,), opacity)
     background = torch.ones(5, 3)
-    return Rendering(background, rays, rays, background), background - contrast
+    shown = what_is_shown(Rendering(background, rays, rays, background), background - contrast)
+    return {name: float(value) for name, value in shown.items()}
 
 
 def test_weights_buffers_and_moments_come_back(caplog):
@@ -109,14 +110,12 @@ def test_without_a_good_state_or_a_rollback_left_the_run_ends_at_once(max_rollba
 
 def test_nothing_but_background_for_a_while_is_a_collapse():
     run, recovery = Run(), Recovery(patience=3, keep_every=1)
-    recovery.observe(*batch(0.4, 0.3))
-    recovery.check(1, run.model, run.optimizer, {"loss": 1.0})
+    recovery.check(1, run.model, run.optimizer, {"loss": 1.0}, batch(0.4, 0.3))
     good = run.model[0].weight.detach().clone()
     found = []
     for step in range(2, 5):
         run.step()
-        recovery.observe(*batch(1e-5, 0.3))
-        found.append(recovery.check(step, run.model, run.optimizer, {"loss": 1.0}))
+        found.append(recovery.check(step, run.model, run.optimizer, {"loss": 1.0}, batch(1e-5, 0.3)))
     assert found[:2] == [None, None]
     assert "all background in 3 records in a row (mean opacity 1.0e-05, while pictures differ from it by 0.30)" in str(
         found[2]
@@ -127,8 +126,7 @@ def test_nothing_but_background_for_a_while_is_a_collapse():
 def test_an_empty_picture_of_an_empty_scene_is_no_collapse():
     run, recovery = Run(), Recovery(patience=2)
     for step in range(1, 9):
-        recovery.observe(*batch(1e-5, 0.001))
-        assert recovery.check(step, run.model, run.optimizer, {"loss": 1.0}) is None
+        assert recovery.check(step, run.model, run.optimizer, {"loss": 1.0}, batch(1e-5, 0.001)) is None
 
 
 def test_a_new_run_knows_nothing_of_the_last():

@@ -25,7 +25,10 @@ def read_header(path: Path) -> tuple[int, int, bool]:
             2^25 pixels or 2^14 on a side.
     """
     with _open(path) as image:
-        return image.width, image.height, image.has_transparency_data
+        try:
+            return image.width, image.height, image.has_transparency_data
+        except AssertionError as error:
+            raise ValueError(f"{path}: image has colours of a palette, but no palette") from error
 
 
 def read_image(path: Path, *, width: int, height: int, channels: int, size: tuple[int, int]) -> Bytes:

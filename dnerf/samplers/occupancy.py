@@ -46,6 +46,8 @@ class OccupancySampler(Sampler):
         ValueError: for numbers out of range.
     """
 
+    observed = ("maxima",)
+
     def __init__(
         self,
         box: Sequence[Sequence[float]],

@@ -172,6 +172,18 @@ def test_what_is_no_sensible_image_is_refused_by_its_header(tmp_path: Path, cont
     assert "\n" not in str(caught.value)
 
 
+def test_a_palette_image_without_a_palette_is_refused(tmp_path: Path) -> None:
+    """Found by fuzzing: an AssertionError of Pillow's."""
+    path = tmp_path / "image.png"
+    Image.new("P", (4, 4)).save(path)
+    data = path.read_bytes()
+    begin = data.index(b"PLTE") - 4
+    length = int.from_bytes(data[begin : begin + 4], "big")
+    path.write_bytes(data[:begin] + data[begin + 12 + length :])
+    with pytest.raises(ValueError, match=r"image\.png: image has colours of a palette, but no palette"):
+        read_header(path)
+
+
 def test_cmyk_is_refused(tmp_path: Path) -> None:
     path = save(Image.new("CMYK", (4, 3)), tmp_path / "a.jpg")
     with pytest.raises(ValueError, match="image must be grey, palette, RGB or RGBA, got CMYK"):

@@ -1,14 +1,11 @@
 """The scripts as a user runs them: in processes of their own."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
+from launcher import run_script
 
-ROOT = Path(__file__).parents[2]
 TINY = (
     "data.resolution=24",
     "data.num_train=4",
@@ -19,11 +16,6 @@ TINY = (
     "trainer.progress_bar=false",
     "sampler.resolution=16",
 )
-
-
-def run_script(name, *arguments, cwd):
-    command = [sys.executable, str(ROOT / "scripts" / f"{name}.py"), *arguments]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
 
 @pytest.fixture(scope="module")

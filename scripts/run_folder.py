@@ -1,0 +1,133 @@
+"""The folder of a run: a new one, or the one whose training is continued."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import sweeps
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.types import RunMode
+from hydra_app import load_config
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from dnerf.files import TEMPORARY, claimed, remove_leftovers, write_json, write_text
+
+# What may be another when a run is continued: how long, where and how it is watched, not what is trained.
+CHANGEABLE = (
+    "out_dir",
+    "resume",
+    "device",
+    "process_timeout",
+    "evaluate_split",
+    "evaluate_frames",
+    "chunk",
+    "tensorboard",
+    "preview_every",
+    "trainer.num_steps",
+    "trainer.max_seconds",
+    "trainer.log_every",
+    "trainer.checkpoint_every",
+    "trainer.progress_bar",
+    "data.root",
+)
+OWN_FOLDERS = ("checkpoints", "previews")
+
+
+def continued(config: DictConfig) -> DictConfig:
+    """The config that a run goes by: the given one, checked against the folder's own if it is continued.
+
+    With `resume=true` what the command does not name is taken from the folder, so that the original one need not be
+    repeated; what it names must be as it was, unless it may change (`CHANGEABLE`).
+
+    Raises:
+        ValueError: if `out_dir` is not given, or names the setting that differs from the run's own.
+    """
+    if not config.resume:
+        return config
+    folder = folder_of(config)
+    if not (folder / "config.yaml").is_file():
+        return config
+    saved = load_config(str(folder))
+    hydra = HydraConfig.get()
+    overrides = OverridesParser.create().parse_overrides(list(hydra.overrides.task))
+    given = {override.get_key_element().lstrip("+~").partition("@")[0] for override in overrides}
+    values = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    assert isinstance(values, DictConfig)
+    if given & set(hydra.runtime.choices):  # an experiment or another group was named: all of it must agree
+        _check_same(_leaves(saved), _leaves(values), folder)
+        return config
+    before, now = ({key: OmegaConf.select(node, key) for key in given} for node in (saved, values))
+    _check_same(before, now, folder)
+    for key in given & set(CHANGEABLE):
+        OmegaConf.update(saved, key, OmegaConf.select(values, key), force_add=True)
+    return saved
+
+
+def _check_same(before: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
+    for key in sorted(before.keys() | now.keys()):
+        if key not in CHANGEABLE and before.get(key) != now.get(key):
+            raise ValueError(
+                f"resume: {key} must be {before.get(key)} as when {folder} began, got {now.get(key)}; "
+                "choose another out_dir for another run"
+            )
+
+
+def _leaves(node: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted names and values of a config's leaves; lists are values."""
+    result: dict[str, Any] = {}
+    for key, value in node.items():
+        nested = isinstance(value, DictConfig) and value
+        result |= _leaves(value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
+    return result
+
+
+def folder_of(config: DictConfig) -> Path:
+    """Where a run's files go: `out_dir`, below it in a multirun, or a new name if none is given.
+
+    Raises:
+        ValueError: if a run is to be continued that has no name.
+    """
+    if config.resume and not config.out_dir:
+        raise ValueError("resume=true needs out_dir, the folder of the run to be continued")
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        return sweeps.sweep_folder() / sweeps.job_name()
+    if config.out_dir:
+        return Path(config.out_dir)
+    choice = HydraConfig.get().runtime.choices.get("experiment") or "run"
+    return Path(f"runs/{choice}-{datetime.now().strftime('%Y-%m-%d-%H-%M-%S')}")
+
+
+@contextmanager
+def opened(config: DictConfig) -> Iterator[Path]:
+    """Make or reopen a run's folder and hold it for this process; the resolved config lies in it.
+
+    Raises:
+        ValueError: if the folder holds another run and `resume` is not set, holds no run at all or links, or is in use.
+    """
+    folder = folder_of(config)
+    holds_run = (folder / "config.yaml").is_file()
+    if folder.exists() and not (holds_run and config.resume) and not _is_free(folder):
+        hint = "continue it with resume=true or choose" if holds_run else "choose"
+        raise ValueError(f"out_dir: {folder} already holds another run or other files; {hint} a new folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in folder.iterdir():
+        if path.is_symlink():  # a folder that somebody else made could have us write anywhere
+            raise ValueError(f"out_dir: {path} is a link; a run's folder holds files and folders of its own")
+    with claimed(folder):
+        for path in (folder, *(folder / name for name in OWN_FOLDERS)):
+            remove_leftovers(path)
+        saved = config.copy()
+        with open_dict(saved):
+            saved.out_dir, saved.resume = str(folder), False
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(saved, resolve=True))
+        if not (folder / "overrides.json").exists():
+            write_json(folder / "overrides.json", list(HydraConfig.get().overrides.task))
+        yield folder
+
+
+def _is_free(folder: Path) -> bool:
+    """Whether a folder is empty but for what a run killed at its very beginning leaves."""
+    return folder.is_dir() and all(path.name.startswith(TEMPORARY) for path in folder.iterdir())
