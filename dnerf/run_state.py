@@ -36,9 +36,9 @@ class RunState:
         step: steps done.
         seconds: training time spent.
         rays_done: rays of all steps done.
-        rollbacks: how often the run has been brought back, see `dnerf.recovery`.
         record: the last record of training as JSON values, or None before the first.
         data: fingerprint of the frames that are learnt, "" if nobody asks.
+        rollbacks: how often the run has been brought back, see `dnerf.recovery`.
     """
 
     modules: Mapping[str, nn.Module]
@@ -48,9 +48,9 @@ class RunState:
     step: int = 0
     seconds: float = 0.0
     rays_done: int = 0
-    rollbacks: int = 0
     record: dict[str, Any] | None = None
     data: str = ""
+    rollbacks: int = 0
 
     def encode(self) -> bytes:
         """The state as the bytes of one file."""

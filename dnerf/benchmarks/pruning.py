@@ -119,7 +119,7 @@ def _using(renderer: Renderer, sampler: OccupancySampler, cut: float) -> Iterato
     before = renderer.sampler, getattr(renderer, "stop_transmittance", None)
     renderer.sampler = sampler
     if before[1] is not None:
-        renderer.stop_transmittance = cut  # type: ignore[assignment]
+        renderer.stop_transmittance = cut
     try:
         yield
     finally:
