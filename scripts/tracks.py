@@ -16,6 +16,8 @@ from dnerf.benchmarks.flow import endpoint_rows
 from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.data import SyntheticData
+from dnerf.deformations import Deformation
+from dnerf.deformations.fixed_point import jacobians
 from dnerf.files import write_json
 from dnerf.motion import motion_model
 from dnerf.renderer import Renderer
@@ -51,6 +53,13 @@ def main(config: DictConfig) -> None:
     np.savez_compressed(output.parent / f"{output.stem}.npz", **arrays)
     print(f"{points.shape[0]} tracks over {len(times)} frames: {output}, {still}")
     print(f"residual: median {tracks.residuals.median():.2e}, largest {tracks.residuals.max():.2e} world units")
+    model = motion_model(renderer)
+    if isinstance(model, Deformation):
+        smallest = min(
+            float(torch.linalg.det(jacobians(model, places, torch.full_like(places[:, 0], time))).min())
+            for places, time in zip(tracks.positions, times)
+        )
+        print(f"smallest Jacobian determinant along the tracks: {smallest:.3f} (negative where space folds)")
     if isinstance(data, SyntheticData):
         _measure(renderer, data, Path(config.run) / "motion.json", device)
 

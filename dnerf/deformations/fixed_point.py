@@ -57,7 +57,7 @@ def invert(
     check_shape("guess", x, canonical.shape)
     inverse_jacobian = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
     if use_jacobian:
-        jacobian = _jacobians(deformation, x, times)
+        jacobian = jacobians(deformation, x, times)
         # Damped, for there to be a step where the map is flat.
         damped = jacobian.mT @ jacobian + 1e-6 * inverse_jacobian
         inverse_jacobian = torch.linalg.solve(damped, jacobian.mT)
@@ -103,11 +103,11 @@ def attach_gradient(deformation: Map, world: Tensor, canonical: Tensor, times: T
     Differentiable once. J must not be singular.
     """
     world = world.detach()
-    inverse_jacobian = torch.linalg.inv(_jacobians(deformation, world, times))
+    inverse_jacobian = torch.linalg.inv(jacobians(deformation, world, times))
     return world - _apply(inverse_jacobian, deformation(world, times) - canonical)
 
 
-def _jacobians(deformation: Map, positions: Tensor, times: Tensor) -> Tensor:
+def jacobians(deformation: Map, positions: Tensor, times: Tensor) -> Tensor:
     """Derivatives (..., 3, 3) of canonical positions (rows) to world positions (columns), without gradient."""
     with torch.enable_grad():
         x = positions.detach().clone().requires_grad_()

@@ -38,7 +38,7 @@ class Solver:
         rtol: relative tolerance of an adaptive one.
         atol: absolute tolerance of an adaptive one, in world units. In float32, tolerances below 1e-6 only cost.
         gradient: "direct" differentiates the solver's steps; "adjoint" solves the adjoint equation backwards, whose
-            memory does not grow with the number of steps (Chen et al. 2018, arXiv 1806.07366, algorithm 2).
+            memory does not grow with the number of steps (Chen et al. 2018, arXiv 1806.07366, algorithm 1).
         max_steps: of an adaptive solver, accepted and refused ones together, before it gives up.
 
     Raises:

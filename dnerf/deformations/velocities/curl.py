@@ -16,7 +16,7 @@ class CurlVelocity(Velocity):
 
     In closed form `v = sum_k cos(k_k . x + b_k) w (k_k x a_k) + grad w x A`: free of divergence to rounding and zero
     outside the box, since the potential is windowed, not the velocity. The waves are learnt; their amplitudes are a
-    small network of time, zero at initialisation. (FreeGave, arXiv 2501.?, keeps volumes by a basis as well.)
+    small network of time, zero at initialisation. (FreeGave (2025) keeps volumes by a basis as well.)
 
     Args:
         box: (2, 3) corners outside of which nothing moves, in world units.
