@@ -120,9 +120,10 @@ class _Path:
                 rows = rows.repeat_interleave(2)
                 cells = (2 * cells[:, None] + torch.arange(2, device=device)).reshape(-1)
         # Shares are whole multiples of a power of two: neighbours have the same bits at the edge that they share.
-        inside = [self.excess(rows, (cells.double() + k) * RESOLUTION) <= 0 for k in (0, 1)]
-        changes = inside[0] != inside[1]
-        found_rows, shares = rows[changes], (cells[changes].double() + 0.5) * RESOLUTION
+        first, second = (self.excess(rows, (cells.double() + k) * RESOLUTION) for k in (0, 1))
+        changes = (first <= 0) != (second <= 0)
+        first, second = first[changes], second[changes]
+        found_rows, shares = rows[changes], (cells[changes].double() + first / (first - second)) * RESOLUTION
         ends = torch.arange(num_rays, device=device)
         for share in (0.0, 1.0):
             at_end = self.excess(ends, torch.full_like(self.low, share)) <= 0

@@ -80,7 +80,7 @@ def to_world(scene: AnalyticScene, local: Tensor, owners: Tensor, times: Tensor)
 
 @pytest.mark.parametrize("make_rays", [random_rays, rays_within])
 def test_pictures_agree_with_brute_force(scene: AnalyticScene, make_rays) -> None:
-    rays = make_rays(12)
+    rays = make_rays(6)
     rendering = render(scene, rays)
     assert (rendering.opacity > 0).any()
     for i in range(len(rays)):
@@ -136,7 +136,7 @@ def test_the_canonical_camera_sees_the_whole_box_between_near_and_far(scene: Ana
 
 
 def test_each_ray_has_its_own_time(scene: AnalyticScene) -> None:
-    rays = random_rays(40)
+    rays = random_rays(12)
     together = render(scene, rays)
     for i in range(len(rays)):
         alone = render(scene, rays[i : i + 1])
