@@ -9,11 +9,14 @@ from omegaconf import DictConfig
 
 from dnerf.files import write_text
 from dnerf.report import read_scores, write_report_text
+from dnerf.sequences import OUTPUTS
 
 SHEETS = (
     ("contact_sheet", "Contact sheet", "Frames spread evenly over the split: prediction, truth, absolute error."),
     ("worst_frames", "Worst frames", "Lowest PSNR first: prediction, truth, absolute error."),
 )
+OTHER_OUTPUTS = tuple(f"_{output}" for output in OUTPUTS if output != "rgb")
+"""Ends of the names of films that show something else than colour: they come after those that do."""
 
 
 def main(config: DictConfig) -> None:
@@ -21,7 +24,8 @@ def main(config: DictConfig) -> None:
     load_config(config.run)
     folder = Path(config.run)
     metrics = read_scores(folder)
-    films = sorted((folder / "renders").glob("*.mp4")) if config.films is None else [Path(f) for f in config.films]
+    found = sorted((folder / "renders").glob("*.mp4"), key=lambda film: (film.stem.endswith(OTHER_OUTPUTS), film.name))
+    films = found if config.films is None else [Path(film) for film in config.films]
     for film in films:
         if not film.is_file():
             raise ValueError(f"films: {film} does not exist")

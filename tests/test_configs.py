@@ -82,8 +82,7 @@ def test_blender_data_reads_what_make_dataset_writes(tmp_path):
     assert difference.abs().max() <= 1
 
 
-@pytest.mark.parametrize("script", ["evaluate", "render", "make_dataset", "tracks"])
-@pytest.mark.parametrize("script", ["benchmark", "evaluate", "render", "make_dataset"])
+@pytest.mark.parametrize("script", ["benchmark", "evaluate", "make_dataset", "render", "tracks"])
 def test_script_configs_compose(script):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for path in names("path") if script == "render" else [None]:
