@@ -132,15 +132,15 @@ def main() -> int:
         lasted = finish(Path(place) / "again")
         found = differences(Path(place) / "again", expected)
         print(f"an uninterrupted run takes {lasted:.1f} s; differences between two: {', '.join(found) or 'none'}")
-        done = 0
+        done = runs = 0
         while done < arguments.kills:
-            folder = Path(place) / f"run{done}"
+            folder, runs = Path(place) / f"run{runs}", runs + 1
             for turn in range(min(arguments.kills_per_run, arguments.kills - done)):
                 while_writing = turn % 2 == 1
                 delay = chance.uniform(0, lasted / 2 if while_writing else lasted)
                 ending = kill(folder, delay, while_writing=while_writing)
                 endings[ending] = endings.get(ending, 0) + 1
-                done += 1
+                done += ending != "had ended"
             finish(folder, "resume=true")
             found = differences(folder, expected)
             failures += bool(found)
