@@ -84,7 +84,17 @@ def test_a_state_has_all_that_training_changes() -> None:
     assert {"renderer.sampler.maxima", "renderer.sampler.occupied", "random.run", "random.cpu"} <= tensors.keys()
     for name, _ in small_renderer().named_parameters():
         assert {f"optimizer.{name}.{key}" for key in ("step", "exp_avg", "exp_avg_sq")} <= tensors.keys()
-    assert facts.keys() == {"format", "device", "step", "seconds", "num_rays", "rays_done", "rollbacks", "record", "data"}
+    assert facts.keys() == {
+        "format",
+        "device",
+        "step",
+        "seconds",
+        "num_rays",
+        "rays_done",
+        "rollbacks",
+        "record",
+        "data",
+    }
 
 
 @pytest.mark.parametrize("stop", [1, 4, 7, 9])

@@ -1,0 +1,325 @@
+"""What a flow costs and how right it is: solvers, variants, recovered motion. Each function returns rows of a table."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dnerf.benchmarks.closed_flows import CLOSED_FLOWS, ClosedFlow
+from dnerf.checks import check_positive
+from dnerf.deformations import (
+    Deformation,
+    DisplacementDeformation,
+    FlowDeformation,
+    IntegrationError,
+    LatticeFlow,
+    SkippingFlow,
+)
+from dnerf.deformations.solvers import ADAPTIVE_SOLVERS, FIXED_SOLVERS
+from dnerf.deformations.velocities import CurlVelocity, GridVelocity, NetworkVelocity, RigidVelocity, Velocity
+from dnerf.motion import MotionModel, carry
+from dnerf.scenes import AnalyticScene
+
+Row = dict[str, Any]
+
+BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
+STEPS = (1, 2, 4, 8, 16, 32)
+TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+
+
+def milliseconds(function: Callable[[], object], repeats: int) -> float:
+    """Median wall-clock milliseconds of a call, after one that is not counted; waits for the GPU if there is one."""
+    durations = []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        function()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        durations.append(1e3 * (time.perf_counter() - begin))
+    return median(durations[1:])
+
+
+def smooth_network() -> NetworkVelocity:
+    """A smooth network velocity that moves points by about half a unit over one unit of time; always the same."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        velocity = NetworkVelocity(BOX, 3, 64, position_frequencies=1, time_frequencies=2)
+        assert velocity.mlp.output is not None
+        torch.nn.init.normal_(velocity.mlp.output.weight, std=0.1)
+    return velocity
+
+
+def solver_rows(
+    fields: Sequence[str] = (*CLOSED_FLOWS, "network"),
+    *,
+    num_points: int = 4096,
+    steps: Sequence[int] = STEPS,
+    tolerances: Sequence[float] = TOLERANCES,
+    repeats: int = 3,
+    device: str = "cpu",
+) -> list[Row]:
+    """Error of every solver against its function evaluations and milliseconds, in float64.
+
+    Points in [-1, 1]^3 at random times in [0, 1] are carried to time 0. The truth is the closed form, or for
+    "network" RK4 with 256 steps.
+
+    Args:
+        fields: names of `CLOSED_FLOWS`, or "network" (a smooth network of 3 x 64).
+        num_points: carried at a time.
+        steps: of the fixed-step solvers.
+        tolerances: of the adaptive ones, relative and absolute.
+        repeats: timed calls of each.
+        device: where to compute.
+
+    Returns:
+        Rows of field, solver, setting, evaluations, milliseconds, max_error, mean_error and round_trip (largest
+        distance after the way there and the uncorrected way back, infinite if that fails), in world units.
+    """
+    check_positive("num_points", num_points)
+    check_positive("repeats", repeats)
+    generator = torch.Generator().manual_seed(0)
+    positions = (torch.rand(num_points, 3, generator=generator, dtype=torch.float64) * 2 - 1).to(device)
+    times = torch.rand(num_points, generator=generator, dtype=torch.float64).to(device)
+    settings: list[tuple[str, str, dict[str, Any]]] = [
+        (solver, f"{n} steps", {"num_steps": n}) for solver in FIXED_SOLVERS for n in steps
+    ]
+    settings += [
+        (solver, f"tolerance {tolerance:g}", {"rtol": tolerance, "atol": tolerance, "max_steps": 100_000})
+        for solver in ADAPTIVE_SOLVERS
+        for tolerance in tolerances
+    ]
+    rows = []
+    for field in fields:
+        velocity = (smooth_network() if field == "network" else CLOSED_FLOWS[field]()).double().to(device)
+        truth = _truth(velocity, positions, times)
+        for solver, setting, arguments in settings:
+            rows.append(
+                {
+                    "field": field,
+                    "solver": solver,
+                    "setting": setting,
+                    **_measure(FlowDeformation(velocity, solver=solver, **arguments), positions, times, truth, repeats),
+                }
+            )
+    return rows
+
+
+@torch.no_grad()
+def _truth(velocity: Velocity, positions: Tensor, times: Tensor) -> Tensor:
+    if isinstance(velocity, ClosedFlow):
+        return velocity.carry(positions, times, torch.zeros_like(times))
+    return FlowDeformation(velocity, num_steps=256)(positions, times)
+
+
+@torch.no_grad()
+def _measure(flow: FlowDeformation, positions: Tensor, times: Tensor, truth: Tensor, repeats: int) -> Row:
+    duration = milliseconds(lambda: flow(positions, times), repeats)
+    evaluations = flow.evaluations.last
+    carried = flow(positions, times)
+    errors = (carried - truth).norm(dim=-1)
+    return {
+        "evaluations": evaluations,
+        "milliseconds": duration,
+        "max_error": float(errors.max()),
+        "mean_error": float(errors.mean()),
+        "round_trip": _round_trip(flow, carried, times, positions),
+    }
+
+
+def _round_trip(flow: FlowDeformation, carried: Tensor, times: Tensor, positions: Tensor) -> float:
+    try:
+        return float((flow.reverse(carried, times) - positions).norm(dim=-1).max())
+    except IntegrationError:
+        return math.inf
+
+
+def variants() -> dict[str, Deformation]:
+    """Deformations whose costs are compared, untrained, at the sizes that `conf/deformation` gives them."""
+
+    def network(**changes: Any) -> NetworkVelocity:
+        return NetworkVelocity(BOX, **{"activation": "relu", "smoothness": 1, **changes})
+
+    frozen: dict[str, Any] = {"canonical_time": None, "clock": "frozen", "solver": "midpoint", "num_steps": 1}
+    running: dict[str, Any] = {"canonical_time": 0.5, "solver": "midpoint", "num_steps": 2}
+    exact: dict[str, Any] = {"canonical_time": 0.5, "solver": "rk4", "num_steps": 8}
+    skipping = SkippingFlow(FlowDeformation(network(), **frozen), BOX)
+    skipping.motion[:, :, : skipping.motion.shape[2] // 2] = 0
+    return {
+        "displacement (3 x 64)": DisplacementDeformation(
+            3, 64, (), position_frequencies=3, time_frequencies=5, canonical_time=None
+        ),
+        "flow, frozen clock, 1 midpoint step (3 x 64)": FlowDeformation(network(), **frozen),
+        "flow, frozen clock, 1 midpoint step (3 x 48)": FlowDeformation(network(hidden_features=48), **frozen),
+        "flow, frozen clock, 1 midpoint step (2 x 64)": FlowDeformation(network(num_layers=2), **frozen),
+        "flow, frozen clock, 1 midpoint step, grid 16^3 x 17": FlowDeformation(GridVelocity(BOX), **frozen),
+        "flow, frozen clock, 1 midpoint step (3 x 64), lower half still and skipped": skipping,
+        "flow, running clock, 2 midpoint steps (3 x 64)": FlowDeformation(network(), **running),
+        "flow, running clock, 2 midpoint steps, grid 16^3 x 17": FlowDeformation(GridVelocity(BOX), **running),
+        "flow, running clock, 2 midpoint steps, curl of 64 waves": FlowDeformation(CurlVelocity(BOX), **running),
+        "flow, running clock, 2 midpoint steps, 16 rigid clusters": FlowDeformation(RigidVelocity(BOX), **running),
+        "flow, running clock, 8 RK4 steps (3 x 64, silu)": FlowDeformation(
+            network(activation="silu", smoothness=4), **exact
+        ),
+        "the same on a lattice of 16^3 x 17": LatticeFlow(
+            FlowDeformation(network(activation="silu", smoothness=4), **exact), BOX, 16, 17
+        ),
+    }
+
+
+def variant_rows(
+    names: Sequence[str] = (),
+    *,
+    num_samples: int = 24576,
+    num_rays: int = 2000,
+    num_frames: int = 100,
+    repeats: int = 10,
+    precision: torch.dtype | None = torch.bfloat16,
+    device: str = "cpu",
+) -> list[Row]:
+    """Milliseconds of every variant for the samples of one training step, beside the displacement network's.
+
+    Samples lie on a figure-like surface, grouped in rays, each ray with the time of one of the frames.
+
+    Args:
+        names: of `variants`; all if empty.
+        num_samples: per call.
+        num_rays: into which they are grouped.
+        num_frames: distinct times.
+        repeats: timed calls of each.
+        precision: of networks under autocast; None for float32.
+        device: where to compute.
+
+    Returns:
+        Rows of variant, evaluations, points (integrated: samples, or vertices of a lattice), forward_ms, training_ms
+        (forward and backward) and ratio (of training_ms to the first row's).
+    """
+    made = variants()
+    unknown = set(names) - set(made)
+    if unknown:
+        raise ValueError(f"names must be some of {', '.join(made)}; got {', '.join(sorted(unknown))}")
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(num_samples, 3, generator=generator), dim=-1)
+    noise = 0.05 * torch.randn(num_samples, 3, generator=generator)
+    positions = (directions * torch.tensor([0.3, 0.3, 0.9]) + noise).to(device)
+    of_rays = torch.randint(num_frames, (num_rays,), generator=generator) / max(num_frames - 1, 1)
+    times = of_rays[torch.arange(num_samples) * num_rays // num_samples].to(device)
+    rows: list[Row] = []
+    for name in names or made:
+        deformation = made[name].to(device)
+
+        def forward(deformation: Deformation = deformation) -> Tensor:
+            with torch.autocast(positions.device.type, dtype=precision, enabled=precision is not None):
+                return deformation(positions, times)
+
+        def step(forward: Callable[[], Tensor] = forward) -> None:
+            forward().sum().backward()
+
+        with torch.no_grad():
+            forward_ms = milliseconds(forward, repeats)
+        training_ms = milliseconds(step, repeats)
+        flow = deformation.flow if isinstance(deformation, LatticeFlow | SkippingFlow) else deformation
+        points = num_samples
+        if isinstance(deformation, LatticeFlow):
+            points = deformation.num_vertices
+        elif isinstance(deformation, SkippingFlow):
+            points = deformation.num_integrated
+        rows.append(
+            {
+                "variant": name,
+                "evaluations": flow.evaluations.last if isinstance(flow, FlowDeformation) else 1,
+                "points": points,
+                "forward_ms": forward_ms,
+                "training_ms": training_ms,
+                "ratio": training_ms / (rows[0]["training_ms"] if rows else training_ms),
+            }
+        )
+    return rows
+
+
+@torch.no_grad()
+def endpoint_rows(
+    model: MotionModel,
+    scene: AnalyticScene,
+    *,
+    time: float = 0.0,
+    times: Sequence[float] = (0.1, 0.25, 0.5, 0.75, 1.0),
+    num_points: int = 4096,
+    depth: float = 0.05,
+    min_motion: float = 0.01,
+    seed: int = 0,
+) -> list[Row]:
+    """3-D end-point error of recovered motion: distance from where the scene's own matter really goes.
+
+    Points lie near the surface of exactly one body at both times (joints overlap, and there motion has no single
+    truth), at most `depth` below it: pictures show nothing further inside.
+
+    Args:
+        model: recovered motion, see `dnerf.motion`.
+        scene: the truth.
+        time: where points start, in [0, 1].
+        times: where they are followed to.
+        num_points: tried; those that qualify count.
+        depth: in world units.
+        min_motion: points that at none of `times` are so far from where they started are left out, in world units.
+        seed: of the points.
+
+    Returns:
+        Rows of time, num_points, moved (mean distance that matter moves, the error of a model in which nothing does),
+        mean_error, median_error and residual (median, see `carry`), in world units.
+
+    Raises:
+        ValueError: if nothing moves.
+    """
+    start = surface_points(scene, time, num_points, depth=depth, seed=seed)
+    farthest = torch.stack([(scene.advect(start, time, end) - start).norm(dim=-1) for end in times]).amax(0)
+    start = start[farthest > min_motion]
+    if not len(start):
+        raise ValueError(f"scene must have matter that moves by {min_motion} between time {time} and {list(times)}")
+    rows = []
+    for end in times:
+        truth = scene.advect(start, time, end)
+        moments = torch.full_like(truth[:, 0], end)
+        alone = scene.contains(truth, moments).sum(-1) == 1
+        points, target = start[alone], truth[alone]
+        moved, residual = carry(model, points, time, end)
+        errors = (moved - target).norm(dim=-1)
+        rows.append(
+            {
+                "time": end,
+                "num_points": len(points),
+                "moved": float((points - target).norm(dim=-1).mean()),
+                "mean_error": float(errors.mean()),
+                "median_error": float(errors.median()),
+                "residual": float(residual.median()),
+            }
+        )
+    return rows
+
+
+def surface_points(scene: AnalyticScene, time: float, num_points: int, *, depth: float, seed: int) -> Tensor:
+    """Points (N, 3) in exactly one body and at most about `depth` below its surface; N <= num_points.
+
+    Raises:
+        ValueError: if a scene has no such points.
+    """
+    check_positive("depth", depth)
+    generator = torch.Generator(scene.box.device).manual_seed(seed)
+    found: list[Tensor] = []
+    for _ in range(64):
+        unit = torch.rand(16384, 3, generator=generator, device=scene.box.device)
+        points = torch.lerp(scene.box[0], scene.box[1], unit)
+        shifts = torch.randn(len(points), 3, generator=generator, device=points.device)
+        outside = points + depth * torch.nn.functional.normalize(shifts, dim=-1)
+        times = torch.full_like(points[:, 0], time)
+        kept = (scene.contains(points, times).sum(-1) == 1) & (scene.body_indices(outside, times) < 0)
+        found.append(points[kept])
+        if sum(len(part) for part in found) >= num_points:
+            break
+    points = torch.cat(found)[:num_points]
+    if not len(points):
+        raise ValueError(f"scene must have matter within {depth} of its surface at time {time}, found none")
+    return points
