@@ -2,6 +2,11 @@
 
 import os
 
+# Tests in parallel share the cores; this is read when torch is imported, and by the scripts that tests start.
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    os.environ["OMP_NUM_THREADS"] = str(max(1, cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])))
+
 import pytest
 import torch
 from hypothesis import settings

@@ -23,7 +23,7 @@ class Gray(RadianceField):
         return torch.ones_like(times)
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
-        return FieldOutput(self.density(positions, times), torch.full_like(positions, 0.5), {"times": times})
+        return FieldOutput(self.density(positions, times), torch.full_like(positions, 0.5), {"halves": times / 2})
 
 
 def test_field_is_asked_at_canonical_positions_and_the_same_times_and_directions() -> None:
@@ -40,6 +40,8 @@ def test_field_is_asked_at_canonical_positions_and_the_same_times_and_directions
 def test_canonical_positions_come_with_the_output_and_extras_are_kept() -> None:
     positions, times = torch.randn(8, 3), torch.rand(8)
     extras = DeformedField(Drift(), Gray())(positions, positions, times).extras
-    assert extras.keys() == {"times", "canonical_positions"}
+    assert extras.keys() == {"halves", "positions", "times", "canonical_positions"}
+    assert torch.equal(extras["halves"], times / 2)
+    assert torch.equal(extras["positions"], positions)
     assert torch.equal(extras["times"], times)
     assert torch.equal(extras["canonical_positions"], Drift()(positions, times))

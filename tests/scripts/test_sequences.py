@@ -15,8 +15,9 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
+from launcher import ROOT, run_script
 from omegaconf.errors import OmegaConfBaseException
-from test_scripts import ROOT, TINY, run_script
+from test_scripts import TINY
 
 from dnerf.data import load_blender
 from dnerf.metrics import psnr
