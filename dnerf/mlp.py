@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from dnerf.checks import check_choice, check_positive
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "relu": torch.relu,
+    "relu": torch.relu_,
     "silu": nn.functional.silu,
     "softplus": nn.functional.softplus,
 }

@@ -109,10 +109,10 @@ def print_scores(metrics: dict[str, object], folder: Path, name: str = "metrics.
     for frame in frames:
         print(f"{frame['index']:>6}  {frame['time']:>5.3f}  {frame['psnr']:>6.2f}  {frame['ssim']:>6.4f}")
     print(f"{'mean':>6}  {'':>5}  {metrics['psnr']:>6.2f}  {metrics['ssim']:>6.4f}")
-    for name in ("interpolation", "extrapolation"):
-        group = metrics.get(name)
+    for part in ("interpolation", "extrapolation"):
+        group = metrics.get(part)
         if isinstance(group, dict) and group["num_frames"]:
-            print(f"{name}: {group['num_frames']} frames, {group['psnr']:.2f} dB, SSIM {group['ssim']:.4f}")
+            print(f"{part}: {group['num_frames']} frames, {group['psnr']:.2f} dB, SSIM {group['ssim']:.4f}")
     print(
         f"{metrics['num_frames']} {metrics['split']} frames, {metrics['seconds_per_frame']:.3f} s a frame; "
         f"trained {metrics['train_seconds']:.0f} s, {metrics['num_steps']} steps, "

@@ -12,6 +12,8 @@ from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 from dnerf.samplers.visibility import visible_samples
 
+# Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
+FIRST_ROUND = 64
 NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no picture shows
 
 
@@ -128,7 +130,10 @@ class OccupancySampler(Sampler):
         return samples.padded(self.pad_to)
 
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
-        marked = visible_samples(samples, rays, field, self.min_weight, pad_to=self.pad_to, observe=self.observe)
+        marked = visible_samples(
+            samples, rays, field, self.min_weight,
+            first_round=FIRST_ROUND, pad_to=self.pad_to, observe=self.observe,
+        )  # fmt: skip
         kept = marked.nonzero()[:, 0]
         kept_before = torch.nn.functional.pad(marked.cumsum(0), (1, 0))
         assert samples.ray_indices is not None

@@ -49,6 +49,7 @@ def test_evaluation_repeats_the_scores_of_training(trained):
     after = json.loads((trained / "run" / "metrics.json").read_text())
     assert after["frames"] == before["frames"]
     assert f"{after['psnr']:.2f}" in done.stdout
+    assert "run/metrics.json" in done.stdout
 
 
 @pytest.mark.parametrize(
