@@ -191,7 +191,8 @@ def is_launched() -> bool:
 def started(device: torch.device, timeout: float) -> Iterator[Processes]:
     """Join the processes that torchrun started, and leave them when the block ends; alone otherwise.
 
-    Numbers on the CPU travel by gloo, those on GPUs by NCCL.
+    Numbers on the CPU travel by gloo, those on GPUs by NCCL. After an error the group stays: it goes with the process,
+    which should then end by `os._exit`.
 
     Args:
         device: where this process trains.
@@ -204,7 +205,7 @@ def started(device: torch.device, timeout: float) -> Iterator[Processes]:
     if device.type == "cuda":
         torch.cuda.set_device(device)
     dist.init_process_group(backend, timeout=timedelta(seconds=timeout))
-    try:
-        yield Processes(dist.get_rank(), dist.get_world_size())
-    finally:
-        dist.destroy_process_group()
+    # No `finally`: whoever drops the last reference to a group with work that has failed, DDP's reducer in a traceback
+    # for one, waits for a thread that waits for the interpreter's lock, for ever.
+    yield Processes(dist.get_rank(), dist.get_world_size())
+    dist.destroy_process_group()

@@ -1,6 +1,7 @@
 """What the scripts share: Hydra entry points with one-line errors, objects from configs, saved configs."""
 
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -9,7 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
 import sweeps
@@ -84,23 +85,38 @@ def _one_line_errors() -> Iterator[None]:
     except TrainingStopped as stop:
         if int(os.environ.get("RANK", "0")) == 0:
             print(f"{stop}; continue with resume=true", file=sys.stderr)
-        sys.exit(stop.exit_code)
+        _leave(stop.exit_code)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        sys.exit(128 + signal.SIGINT)
+        _leave(128 + signal.SIGINT)
     except USER_ERRORS as error:
         if os.environ.get("DNERF_TRACEBACK") == "1":
             raise
         rank = os.environ.get("RANK", "0")
         print(f"error: {f'process {rank}: ' if rank != '0' else ''}{one_line(error)}", file=sys.stderr)
-        sys.exit(WRONG_INPUT)
+        _leave(WRONG_INPUT)
     except BrokenProcessPool as error:
         print(
             f"error: a worker of the sweep was killed ({one_line(error)[:200]}); the same command with resume=true "
             "runs what is missing",
             file=sys.stderr,
         )
-        sys.exit(WRONG_INPUT)
+        _leave(WRONG_INPUT)
+    except Exception:
+        if not is_launched():
+            raise
+        traceback.print_exc()
+        _leave(1)
+
+
+def _leave(code: int) -> NoReturn:
+    """End this process; one of several at once, since taking down a group that has lost a member may hang."""
+    if is_launched():
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _tell_workers_where_we_are() -> None:
