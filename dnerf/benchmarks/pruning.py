@@ -108,24 +108,19 @@ def _settings(
         yield "resolution", value, filled(resolution=value), 0.0
     for value in options["slabs"][few]:
         yield "slabs", value, filled(num_slabs=value), 0.0
-    if hasattr(renderer, "stop_transmittance"):
-        for value in options["cuts"][few]:
-            yield "cut-off", value, trained, value
+    for value in options["cuts"][few]:
+        yield "cut-off", value, trained, value
 
 
 @contextmanager
 def _using(renderer: Renderer, sampler: OccupancySampler, cut: float) -> Iterator[None]:
     """Render with another sampler and cut-off within a `with` block."""
-    before = renderer.sampler, getattr(renderer, "stop_transmittance", None)
-    renderer.sampler = sampler
-    if before[1] is not None:
-        renderer.stop_transmittance = cut
+    before = renderer.sampler, renderer.stop_transmittance
+    renderer.sampler, renderer.stop_transmittance = sampler, cut
     try:
         yield
     finally:
-        renderer.sampler = before[0]
-        if before[1] is not None:
-            renderer.stop_transmittance = before[1]
+        renderer.sampler, renderer.stop_transmittance = before
 
 
 def _pictures(
