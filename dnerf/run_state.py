@@ -15,12 +15,12 @@ from torch import Tensor, nn
 from dnerf.checkpoints import MAX_HEADER, check_fit, decode, encode, num_bytes, read_limited
 from dnerf.data.frames import Frames
 from dnerf.files import write_bytes
+from dnerf.optimizers import moments_of
 from dnerf.records import TrainingRecord, not_finite
 
 logger = logging.getLogger(__name__)
 
 FORMAT = 1
-MOMENTS = {"step", "exp_avg", "exp_avg_sq"}  # what Adam remembers of a parameter
 NAME = re.compile(r"step_(\d{8,})\.safetensors")
 
 
@@ -90,7 +90,7 @@ class RunState:
         moments = {name: value for name, value in tensors.items() if name.startswith("optimizer.")}
         check_fit(expected, {name: value for name, value in tensors.items() if name not in moments}, where)
         parameters = dict(self.modules["renderer"].named_parameters())
-        state = _optimizer_state(moments, parameters, where)
+        state = _optimizer_state(moments, self.optimizer, parameters, where)
         self._set_random_states(tensors, where)
         for name, module in self.modules.items():
             own = f"{name}."
@@ -169,20 +169,23 @@ def _check_record(record: object, where: object) -> None:
 
 
 def _optimizer_state(
-    moments: Mapping[str, Tensor], parameters: Mapping[str, nn.Parameter], where: object
+    moments: Mapping[str, Tensor],
+    optimizer: torch.optim.Optimizer,
+    parameters: Mapping[str, nn.Parameter],
+    where: object,
 ) -> dict[str, dict[str, Tensor]]:
-    """Adam's tensors by parameter and name, checked; parameters that had no gradient yet have none."""
+    """The optimiser's tensors by parameter and name, checked; parameters that had no gradient yet have none."""
     state: dict[str, dict[str, Tensor]] = {}
     for full, value in moments.items():
         name, _, key = full.removeprefix("optimizer.").rpartition(".")
-        if name not in parameters or key not in MOMENTS:
+        if name not in parameters or key not in moments_of(optimizer, parameters[name]):
             raise ValueError(f"{where}: does not fit its config: unexpected {full!r}")
         like = torch.empty(()) if key == "step" else parameters[name]
         check_fit({full: like}, {full: value}, where)
         state.setdefault(name, {})[key] = value
     for name, values in state.items():
-        if values.keys() != MOMENTS:
-            raise ValueError(f"{where}: does not fit its config: missing {sorted(MOMENTS - values.keys())} of {name}")
+        if missing := moments_of(optimizer, parameters[name]) - values.keys():
+            raise ValueError(f"{where}: does not fit its config: missing {sorted(missing)} of {name}")
     return state
 
 

@@ -16,6 +16,7 @@ from dnerf.checks import check_choice, check_positive
 from dnerf.data.frames import Frames, composite_on
 from dnerf.distributed import Processes
 from dnerf.losses import Loss, PhotometricLoss
+from dnerf.optimizers import AdamMuon
 from dnerf.records import Outcome, TrainingRecord, check_finite, psnr_of, show
 from dnerf.recovery import SHOWN, Recovery, what_is_shown
 from dnerf.renderer import Renderer
@@ -51,6 +52,8 @@ class Trainer:
         warmup_steps: steps over which the factor rises linearly from near zero.
         betas: Adam's moment decay rates.
         epsilon: Adam's epsilon.
+        orthogonal: parameter-name prefixes of the renderer below which the weight matrices of networks (those of 16
+            rows and columns or more) take orthogonalised steps, see `AdamMuon`.
         losses: terms by name; the photometric loss if None.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
@@ -75,6 +78,7 @@ class Trainer:
         warmup_steps: int = 0,
         betas: Sequence[float] = (0.9, 0.999),
         epsilon: float = 1e-8,
+        orthogonal: Sequence[str] = (),
         losses: Mapping[str, Loss] | None = None,
         log_every: int = 20,
         checkpoint_every: int | None = 1000,
@@ -106,6 +110,7 @@ class Trainer:
         self.warmup_steps = warmup_steps
         self.betas = (betas[0], betas[1])
         self.epsilon = epsilon
+        self.orthogonal = tuple(orthogonal)
         self.losses = nn.ModuleDict({"rgb": PhotometricLoss()} if losses is None else dict(losses))
         self.log_every = log_every
         self.checkpoint_every = checkpoint_every
@@ -268,14 +273,25 @@ class Trainer:
         detached = {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse, **shown}.items()}
         return Outcome(detached, weight, rendering.samples.starts.numel(), factor)
 
-    def _optimizer(self, renderer: Renderer) -> torch.optim.Optimizer:
-        groups: dict[str, list[nn.Parameter]] = {prefix: [] for prefix in self.learning_rates}
+    def _optimizer(self, renderer: Renderer) -> AdamMuon:
+        matrices = {
+            id(module.weight)
+            for name, module in renderer.named_modules()
+            if isinstance(module, nn.Linear) and name.startswith(self.orthogonal) and min(module.weight.shape) >= 16
+        }
+        groups: dict[tuple[str, bool], list[nn.Parameter]] = {
+            (prefix, is_matrix): [] for prefix in self.learning_rates for is_matrix in (False, True)
+        }
         for name, parameter in renderer.named_parameters():
-            prefix = max((p for p in groups if name.startswith(p)), key=len)
-            groups[prefix].append(parameter)
-        rates = self.learning_rates
-        listed = [{"params": group, "lr": rates[name], "initial_lr": rates[name]} for name, group in groups.items()]
-        return torch.optim.Adam([g for g in listed if g["params"]], betas=self.betas, eps=self.epsilon, fused=True)
+            prefix = max((p for p in self.learning_rates if name.startswith(p)), key=len)
+            groups[prefix, id(parameter) in matrices].append(parameter)
+        listed = [
+            {"params": group, "lr": rate, "initial_lr": rate, "orthogonal": is_matrix}
+            for (prefix, is_matrix), group in groups.items()
+            if group
+            for rate in (self.learning_rates[prefix],)
+        ]
+        return AdamMuon(listed, betas=self.betas, eps=self.epsilon, fused=True)
 
     def _next_num_rays(self, num_rays: int, num_samples: int) -> int:
         if self.target_samples is None:

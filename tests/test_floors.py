@@ -35,6 +35,7 @@ FLOORS = {
     "metrics": 6,
     "motion": 6,
     "motion_losses": 6,
+    "optimizers": 6,
     "plots": 6,
     "protocols": 6,
     "records": 6,
