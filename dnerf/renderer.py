@@ -77,12 +77,14 @@ class Renderer(nn.Module):
         """
         with self._autocast(rays.origins.device):
             samples = self.sampler(rays, self.field, generator=generator)
-        return self._render(rays, samples, generator)
+        return self._render(rays, samples, self.field, generator)
 
-    def _render(self, rays: Rays, samples: Samples, generator: torch.Generator | None) -> Rendering:
+    def _render(
+        self, rays: Rays, samples: Samples, field: RadianceField, generator: torch.Generator | None = None
+    ) -> Rendering:
         with self._autocast(rays.origins.device):
             positions, directions, times = samples.locate(rays)
-            output = self.field(positions, directions, times)
+            output = field(positions, directions, times)
         if self.training:
             self.sampler.observe(positions.detach(), times, output.density.detach())
         background = self.background(rays.directions, generator=generator)
@@ -94,17 +96,17 @@ class Renderer(nn.Module):
         )
         return Rendering(**{**vars(rendering), "proposals": proposals})
 
-    def _without_gradients(self, rays: Rays) -> Rendering:
-        """What `forward` shows, without per-sample data: rays end where they are opaque."""
+    def _without_gradients(self, rays: Rays, field: RadianceField) -> Rendering:
+        """What `forward` shows of a field, without per-sample data: rays end where they are opaque."""
         with self._autocast(rays.origins.device):
-            samples = self.sampler(rays, self.field)
+            samples = self.sampler(rays, field)
         if not samples.is_packed or self.stop_transmittance == 0 or self.quadrature != "constant":
-            return self._render(rays, samples, None)
+            return self._render(rays, samples, field)
         sums = rays.origins.new_zeros(len(rays), 5)
 
         def visit(ray_numbers: Tensor, chosen: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
             with self._autocast(rays.origins.device):
-                output = self.field(*part.locate(rays[ray_numbers]))
+                output = field(*part.locate(rays[ray_numbers]))
             seen = composite(part, output)
             columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
             sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))
@@ -154,7 +156,7 @@ class Renderer(nn.Module):
         modes = [(module, module.training) for module in self.modules()]
         self.eval()
         try:
-            parts = list(self._in_chunks(rays, chunk))
+            parts = list(self._in_chunks(rays, self.field.at_time(time), chunk))
         finally:
             for module, mode in modes:
                 module.training = mode
@@ -165,12 +167,12 @@ class Renderer(nn.Module):
             depth=torch.cat([p.depth for p in parts]).reshape(shape),
         )
 
-    def _in_chunks(self, rays: Rays, chunk: int) -> Iterator[Rendering]:
+    def _in_chunks(self, rays: Rays, field: RadianceField, chunk: int) -> Iterator[Rendering]:
         """Render so many rays at a time; half as many from where a GPU's memory does not suffice."""
         start = 0
         while start < len(rays):
             try:
-                part = self._without_gradients(rays[start : start + chunk])
+                part = self._without_gradients(rays[start : start + chunk], field)
             except torch.OutOfMemoryError as error:
                 if chunk == 1:
                     raise MemoryError("the GPU's memory does not suffice for one ray") from error

@@ -41,8 +41,7 @@ def run(settings: Settings) -> SuiteResult:
         raise ValueError(f"pruning.experiment must sample by occupancy, got {type(trained).__name__}")
     chosen = [0, len(frames) // 2]
     everything = _grid(trained, resolution=8, num_slabs=1)
-    everything.occupied.fill_(True)
-    everything.skips.zero_()
+    everything.occupy(torch.tensor(True))
     reference = _pictures(renderer, everything, frames, chosen)
     rows = [
         _measure(renderer, sampler, frames, chosen, reference, settings, knob, value, cut)
@@ -98,8 +97,7 @@ def _settings(
         return grid
 
     everything = _grid(trained, resolution=8, num_slabs=1)
-    everything.occupied.fill_(True)
-    everything.skips.zero_()
+    everything.occupy(torch.tensor(True))
     yield "nothing left out", None, everything, 0.0
     yield "as trained", None, trained, 0.0
     for value in options["thresholds"][few]:

@@ -13,7 +13,6 @@ from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import fitted_order, time_in_turn
 from dnerf.compositing import FieldOutput, composite
 from dnerf.fields import GridField
-from dnerf.kernels import skip_distances
 from dnerf.rays import Rays
 from dnerf.samplers import OccupancySampler
 
@@ -137,8 +136,7 @@ def _occupy(sampler: OccupancySampler, radius: float) -> None:
     places = [torch.arange(n, device=sampler.box.device) + 0.5 for n in cells]
     axes = [sampler.box[0, k] + place * side[k] for k, place in enumerate(places)]
     distance = torch.stack(torch.meshgrid(*axes, indexing="ij")).norm(dim=0)
-    sampler.occupied.copy_((distance <= radius + 0.5 * side.norm()).expand_as(sampler.occupied))
-    sampler.skips.copy_(skip_distances(sampler.occupied))
+    sampler.occupy(distance <= radius + 0.5 * side.norm())
 
 
 def _rays(count: int, radius: float, half: float) -> Rays:

@@ -4,6 +4,7 @@ from dnerf.deformations.base import Deformation, InvertibleDeformation
 from dnerf.deformations.displacement import DisplacementDeformation
 from dnerf.deformations.fixed_point import invert
 from dnerf.deformations.flow import FlowDeformation
+from dnerf.deformations.frame_lattice import FrameLattice, FrozenDeformation
 from dnerf.deformations.identity import IdentityDeformation
 from dnerf.deformations.lattice_flow import LatticeFlow
 from dnerf.deformations.skipping_flow import SkippingFlow
@@ -13,6 +14,8 @@ __all__ = [
     "Deformation",
     "DisplacementDeformation",
     "FlowDeformation",
+    "FrameLattice",
+    "FrozenDeformation",
     "IdentityDeformation",
     "IntegrationError",
     "InvertibleDeformation",

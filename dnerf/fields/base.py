@@ -26,3 +26,11 @@ class RadianceField(nn.Module, ABC):
         Returns:
             `FieldOutput` with density (...,) and rgb (..., 3) in [0, 1].
         """
+
+    def at_time(self, time: float) -> "RadianceField":
+        """The field to ask while a frame of one time is rendered; itself, unless something can be kept for it.
+
+        Args:
+            time: in [0, 1]; what is returned may be asked at no other.
+        """
+        return self

@@ -5,7 +5,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from dnerf.compositing import FieldOutput
-from dnerf.deformations.base import Deformation
+from dnerf.deformations import Deformation, FrameLattice, IdentityDeformation
 from dnerf.fields.base import RadianceField
 
 
@@ -18,12 +18,16 @@ class DeformedField(RadianceField):
     Args:
         deformation: world -> canonical.
         canonical: field in canonical space; it may use the time as well.
+        frame_lattice: where frames see the deformation through a lattice; None for frames that ask it at every sample.
     """
 
-    def __init__(self, deformation: Deformation, canonical: RadianceField) -> None:
+    def __init__(
+        self, deformation: Deformation, canonical: RadianceField, *, frame_lattice: FrameLattice | None = None
+    ) -> None:
         super().__init__()
         self.deformation = deformation
         self.canonical = canonical
+        self.frame_lattice = frame_lattice
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at positions (..., 3) and times (...,)."""
@@ -35,3 +39,10 @@ class DeformedField(RadianceField):
         output = self.canonical(canonical_positions, directions, times)
         extras = {"canonical_positions": canonical_positions, "positions": positions, "times": times}
         return replace(output, extras={**output.extras, **extras})
+
+    def at_time(self, time: float) -> RadianceField:
+        """The same with the deformation kept on the lattice, if there is one and anything moves."""
+        if self.frame_lattice is None or isinstance(self.deformation, IdentityDeformation):
+            return self
+        frozen = self.frame_lattice.at_time(self.deformation, time)
+        return DeformedField(frozen, self.canonical).train(self.training)

@@ -10,7 +10,7 @@ from dnerf.fields.base import RadianceField
 from dnerf.kernels import march, skip_distances
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
-from dnerf.samplers.visibility import visible_samples
+from dnerf.samplers.visibility import joined, visible_samples
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
@@ -39,9 +39,12 @@ class OccupancySampler(Sampler):
         update_every: training steps between updates.
         num_probes: random cells asked at each update.
         margin: cells by which occupied regions are widened in space (0 or 1); time is widened by one slab.
+        render_margin: the same in evaluation mode. Training needs the margin, for matter to move into; pictures of a
+            trained field hardly do, and it is half of their samples. `fill` always takes `margin`.
         min_weight: in training, the field is first asked for densities without gradients, front to back, and only
             samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. (Pictures without
             gradients end rays early instead: `Renderer.stop_transmittance`.)
+        filter_joins: the filter of `min_weight` asks once for so many neighbouring intervals, and keeps all or none.
         pad_to: the number of samples is rounded up to a multiple of this, see `Samples.padded` (1 for no padding).
 
     Raises:
@@ -62,7 +65,9 @@ class OccupancySampler(Sampler):
         update_every: int = 16,
         num_probes: int = 1 << 16,
         margin: int = 1,
+        render_margin: int = 1,
         min_weight: float = 0.0,
+        filter_joins: int = 1,
         pad_to: int = 2048,
     ) -> None:
         super().__init__()
@@ -73,13 +78,15 @@ class OccupancySampler(Sampler):
             ("threshold", threshold),
             ("update_every", update_every),
             ("num_probes", num_probes),
+            ("filter_joins", filter_joins),
             ("pad_to", pad_to),
         ):
             check_positive(name, value)
         if not 0 < decay < 1:
             raise ValueError(f"decay must be in (0, 1), got {decay}")
-        if margin not in (0, 1):
-            raise ValueError(f"margin must be 0 or 1, got {margin}")
+        for name, value in (("margin", margin), ("render_margin", render_margin)):
+            if value not in (0, 1):
+                raise ValueError(f"{name} must be 0 or 1, got {value}")
         corners = as_box(box)
         sides = corners[1] - corners[0]
         cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
@@ -89,7 +96,9 @@ class OccupancySampler(Sampler):
         self.update_every = update_every
         self.num_probes = num_probes
         self.margin = margin
+        self.render_margin = render_margin
         self.min_weight = min_weight
+        self.filter_joins = filter_joins
         self.pad_to = pad_to
         self.register_buffer("box", corners, persistent=False)
         self.register_buffer("shape", torch.tensor([num_slabs, *cells]), persistent=False)
@@ -97,6 +106,9 @@ class OccupancySampler(Sampler):
         self.register_buffer("maxima", torch.full((num_slabs, *cells), NEGLIGIBLE * 1e-3))
         self.register_buffer("occupied", torch.ones((num_slabs, *cells), dtype=torch.bool))
         self.register_buffer("skips", skip_distances(self.occupied), persistent=False)
+        has_own = render_margin != margin
+        self.register_buffer("rendered", self.occupied.clone() if has_own else None)
+        self.register_buffer("rendered_skips", self.skips.clone() if has_own else None, persistent=False)
         self.register_load_state_dict_post_hook(_find_skips)
         self.box: Tensor
         self.shape: Tensor
@@ -104,12 +116,17 @@ class OccupancySampler(Sampler):
         self.skips: Tensor
         self.maxima: Tensor
         self.occupied: Tensor
+        self.rendered: Tensor | None
+        self.rendered_skips: Tensor | None
 
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Packed samples; intervals begin at random offsets in training, at multiples of the step in evaluation."""
         jitter = torch.zeros_like(rays.near)
         if self.training:
             jitter.uniform_(generator=generator)
+        occupied, skips = self.occupied, self.skips
+        if not self.training and self.rendered is not None and self.rendered_skips is not None:
+            occupied, skips = self.rendered, self.rendered_skips
         marched = march(
             rays.origins,
             rays.directions,
@@ -117,10 +134,10 @@ class OccupancySampler(Sampler):
             rays.far,
             times=rays.times,
             jitter=jitter,
-            occupancy=self.occupied,
+            occupancy=occupied,
             aabb=self.box,
             step=self.step_size,
-            skips=self.skips,
+            skips=skips,
         )
         samples = Samples(
             marched.starts, marched.ends, len(rays), ray_indices=marched.ray_indices, ray_offsets=marched.offsets
@@ -130,10 +147,12 @@ class OccupancySampler(Sampler):
         return samples.padded(self.pad_to)
 
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
-        marked = visible_samples(
-            samples, rays, field, self.min_weight,
+        asked, number = joined(samples, self.filter_joins)
+        is_visible = visible_samples(
+            asked, rays, field, self.min_weight,
             first_round=FIRST_ROUND, pad_to=self.pad_to, observe=self.observe,
         )  # fmt: skip
+        marked = is_visible[number]
         kept = marked.nonzero()[:, 0]
         kept_before = torch.nn.functional.pad(marked.cumsum(0), (1, 0))
         assert samples.ray_indices is not None
@@ -185,7 +204,7 @@ class OccupancySampler(Sampler):
         for _ in range(probes_per_cell):
             for cells in torch.arange(self.maxima.numel(), device=device).split(chunk):
                 self._probe(field, cells, torch.rand(len(cells), 4, generator=generator, device=device))
-        self._decide()
+        self._decide(is_filled=True)
 
     def _probe(self, field: RadianceField, cells: Tensor, within: Tensor) -> None:
         unit = (torch.stack(torch.unravel_index(cells, self.maxima.shape), dim=-1) + within) / self.shape
@@ -193,18 +212,37 @@ class OccupancySampler(Sampler):
         density = field.density(positions, unit[:, 0])
         self.maxima.view(-1).scatter_reduce_(0, cells, density.to(self.maxima.dtype), "amax")
 
-    def _decide(self) -> None:
+    def _decide(self, *, is_filled: bool = False) -> None:
         threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
-        self.occupied.copy_(self.maxima > threshold)
-        for axis in range(4 if self.margin else 1):
-            self.occupied.copy_(_widened(self.occupied, axis))
-        self.skips.copy_(skip_distances(self.occupied))
+        tight = _widened(self.maxima > threshold, 0)
+        wide = tight
+        for axis in range(1, 4):
+            wide = _widened(wide, axis)
+        margins = (tight, wide)
+        self._set(margins[self.margin], margins[self.margin if is_filled else self.render_margin])
+
+    @torch.no_grad()
+    def occupy(self, mask: Tensor) -> None:
+        """Say which cells are occupied, in training and in evaluation.
+
+        Args:
+            mask: (K, Gx, Gy, Gz) bool, or what broadcasts to it.
+        """
+        self._set(mask, mask)
+
+    def _set(self, occupied: Tensor, rendered: Tensor) -> None:
+        self.occupied.copy_(occupied)
+        if self.rendered is not None:
+            self.rendered.copy_(rendered)
+        _find_skips(self)
 
 
-def _find_skips(sampler: nn.Module, incompatible_keys: object) -> None:
-    """Derive a loaded sampler's skips, which are not saved."""
+def _find_skips(sampler: nn.Module, incompatible_keys: object = None) -> None:
+    """Derive a sampler's skips, which are not saved."""
     assert isinstance(sampler, OccupancySampler)
     sampler.skips.copy_(skip_distances(sampler.occupied))
+    if sampler.rendered is not None and sampler.rendered_skips is not None:
+        sampler.rendered_skips.copy_(skip_distances(sampler.rendered))
 
 
 def _widened(mask: Tensor, axis: int) -> Tensor:

@@ -231,10 +231,9 @@ def test_a_deformation_that_jumps_is_not_continuous() -> None:
 
 def test_a_sampler_that_forgets_a_slab_pops() -> None:
     model = with_occupancy(fitted("displacement", "pulsing_fog"))
-    model.sampler.occupied[3] = False
-    from dnerf.kernels import skip_distances
-
-    model.sampler.skips.copy_(skip_distances(model.sampler.occupied))
+    remembered = model.sampler.occupied.clone()
+    remembered[3] = False
+    model.sampler.occupy(remembered)
     refused(check_popping(model, RAYS, BOUNDARIES))
 
 

@@ -96,7 +96,7 @@ def test_reference_equals_loop(reference, limit):
     assert_same(actual, loop_march(**arguments, occupancy=grid(), aabb=BOX, step=0.07, limit=limit))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     num_rays=st.integers(0, 80),
     shape=st.tuples(st.integers(1, 3), *[st.integers(1, 50)] * 3),
@@ -104,9 +104,12 @@ def test_reference_equals_loop(reference, limit):
     step=st.sampled_from([0.003, 0.05, 0.4, 20.0]),
     limit=st.sampled_from([None, 1, 5]),
     seed=st.integers(0, 99),
+    part=st.tuples(*[st.tuples(st.integers(0, 49), st.integers(1, 50))] * 3),
 )
-def test_skipping_changes_no_bit(num_rays, shape, share, step, limit, seed):
-    arguments = rays(num_rays, seed) | {"occupancy": grid(shape, share, seed), "aabb": BOX, "step": step}
+def test_skipping_changes_no_bit(num_rays, shape, share, step, limit, seed, part):
+    occupancy, inside = grid(shape, share, seed), torch.zeros(shape, dtype=torch.bool)
+    inside[(slice(None), *(slice(first, first + size) for first, size in part))] = True
+    arguments = rays(num_rays, seed) | {"occupancy": occupancy & inside, "aabb": BOX, "step": step}
     with kernels.use_backend("reference"):
         expected = march(**arguments, max_samples_per_ray=limit)
     with kernels.use_backend("numba"):
@@ -134,7 +137,10 @@ def test_distant_and_nearly_parallel_rays_skip_exactly():
     directions = arguments["directions"]
     directions[::2, 1] = torch.where(directions[::2, 1].abs() < 0.9, 1e-6, directions[::2, 1])
     arguments["far"] += 600
-    arguments |= {"occupancy": grid((3, 40, 40, 40), 0.01), "aabb": BOX, "step": 0.01}
+    occupancy = grid((3, 40, 40, 40), 0.01)
+    occupancy[1, 20:] = False
+    occupancy[2, :, :30, 8:] = False
+    arguments |= {"occupancy": occupancy, "aabb": BOX, "step": 0.01}
     with kernels.use_backend("reference"):
         expected = march(**arguments)
     assert len(expected.starts) > 100

@@ -69,6 +69,46 @@ def test_occupied_cells_are_widened_by_one_cell_and_one_slab() -> None:
     assert sampler.occupied.sum() == 3 * 3 * 3 * 2
 
 
+def test_pictures_may_do_without_the_margin_in_space() -> None:
+    sampler = small(render_margin=0)
+    sampler.maxima.zero_()
+    sampler.maxima[3, 6:10, 6:10, 6:10] = 100.0
+    sampler._decide()
+    assert sampler.occupied.sum() == 3 * 6**3
+    assert sampler.rendered is not None
+    assert sampler.rendered.sum() == 3 * 4**3
+    assert sampler.rendered[2:5, 6:10, 6:10, 6:10].all()
+    trained, rendered = (opacity_samples(sampler.train(mode)) for mode in (True, False))
+    assert 0 < rendered < trained
+    loaded = small(render_margin=0)
+    loaded.load_state_dict(sampler.state_dict())
+    assert opacity_samples(loaded.eval()) == rendered
+
+
+def test_a_filled_grid_keeps_its_margin_in_pictures() -> None:
+    """Eight probes of a cell can miss the corner of a body that no training sample has ever met."""
+    sampler = small(render_margin=0)
+    sampler.fill(MovingBall())
+    assert sampler.rendered is not None
+    assert sampler.rendered.equal(sampler.occupied)
+
+
+def test_cells_can_be_set() -> None:
+    sampler = small(render_margin=0)
+    sampler.occupy(torch.tensor(False))
+    assert opacity_samples(sampler.train()) == opacity_samples(sampler.eval()) == 0
+    mask = torch.zeros(16, 16, 16, dtype=torch.bool)
+    mask[4:8] = True
+    sampler.occupy(mask)
+    assert opacity_samples(sampler.eval()) > 0
+    assert sampler.occupied.sum() == 8 * mask.sum()
+
+
+def opacity_samples(sampler: OccupancySampler) -> int:
+    generator = torch.Generator().manual_seed(0)
+    return int((sampler(rays_towards_origin(300), MovingBall(), generator=generator).lengths > 0).sum())
+
+
 def test_a_thin_uniform_start_empties_nothing() -> None:
     sampler = small()
     for step in range(0, 641, 16):

@@ -120,7 +120,7 @@ def cumulative(edges: torch.Tensor, weights: torch.Tensor, positions: torch.Tens
 
 def test_an_empty_packed_batch_is_rendered_and_differentiated() -> None:
     sampler = OccupancySampler(BOX, 0.05, 16, num_slabs=2)
-    sampler.occupied.zero_()
+    sampler.occupy(torch.tensor(False))
     rays = hard_rays(5, 60)
     density = torch.zeros(0, requires_grad=True)
     samples = sampler(rays, Fog())

@@ -43,7 +43,10 @@ def march(
     if skips is None:
         skips = skip_distances(occupancy)
     reach = skips.contiguous().numpy()
-    launch(_mark, o, d, t0, times_, jitter_, grid, reach, box, size, limit, ranges, counts, kept, offsets.numpy())
+    bounds = np.empty((len(grid), 3, 2), np.int64)
+    launch(_bounds, reach, bounds)
+    arguments = (o, d, t0, times_, jitter_, grid, reach, bounds, box, size, limit, ranges, counts)
+    launch(_mark, *arguments, kept, offsets.numpy())
     torch.cumsum(offsets, 0, out=offsets)
 
     num_samples = int(offsets[-1])
@@ -97,6 +100,36 @@ def _interval(near: Any, jitter: Any, step: Any, enter: Any, leave: Any, index: 
 
 
 @njit(parallel=True, cache=True, nogil=True)
+def _bounds(skips: Any, bounds: Any) -> None:
+    """Per slab and axis: the first block with an occupied cell and the one after the last; empty where none is."""
+    nk, bx, by, bz = skips.shape
+    for k in prange(nk):
+        bounds[k, 0], bounds[k, 1], bounds[k, 2] = (bx, 0), (by, 0), (bz, 0)
+        for x in range(bx):
+            for y in range(by):
+                for z in range(bz):
+                    if skips[k, x, y, z] == 0:
+                        for axis, block in enumerate((x, y, z)):
+                            bounds[k, axis, 0] = min(bounds[k, axis, 0], block)
+                            bounds[k, axis, 1] = max(bounds[k, axis, 1], block + 1)
+
+
+@njit(error_model="numpy")
+def _clip(near: Any, far: Any, position: Any, speed: Any, margin: Any, bounds: Any, size: int) -> Any:
+    """The part of [near, far] in which `position + speed t` may lie, on one axis, in the cells of the bounds."""
+    dtype = type(position)
+    # Cells beyond the grid count as those of its faces.
+    low = dtype(bounds[0] << BLOCK_BITS) - margin if bounds[0] > 0 else dtype(-np.inf)
+    high = dtype(bounds[1] << BLOCK_BITS) + margin if bounds[1] << BLOCK_BITS < size else dtype(np.inf)
+    if bounds[0] >= bounds[1] or (speed == 0 and not low <= position <= high):
+        return near, dtype(-np.inf)
+    if speed == 0:
+        return near, far
+    a, b = (low - position) / speed, (high - position) / speed
+    return max(near, min(a, b)), min(far, max(a, b))
+
+
+@njit(parallel=True, cache=True, nogil=True)
 def _mark(
     origins: Any,
     directions: Any,
@@ -105,6 +138,7 @@ def _mark(
     jitter: Any,
     occupancy: Any,
     skips: Any,
+    bounds: Any,
     aabb: Any,
     step: Any,
     limit: int,
@@ -115,7 +149,8 @@ def _mark(
 ) -> None:
     """Set a bit for every kept interval, and count them.
 
-    From an empty block the march jumps over the intervals whose midpoints are certain to lie in empty blocks too.
+    A ray is followed through the bounds of its slab's occupied blocks; one that misses them costs nothing. From an
+    empty block the march jumps over the intervals whose midpoints are certain to lie in empty blocks too.
     Midpoints round monotonically, and so do the cells computed from them; the margins exceed the rounding of the
     distance to where the empty blocks end. So the result is that of testing every interval.
     """
@@ -135,9 +170,20 @@ def _mark(
         margin_y = _margin(rounding, oy, dy, aabb[0, 1], scale_y, leave, ny)
         margin_z = _margin(rounding, oz, dz, aabb[0, 2], scale_z, leave, nz)
         slack = rounding * max(abs(near[r]), abs(leave)) + dtype(1e-3) * step
+        begin, finish = enter, leave
+        u, v, w = (ox - aabb[0, 0]) * scale_x, (oy - aabb[0, 1]) * scale_y, (oz - aabb[0, 2]) * scale_z
+        begin, finish = _clip(begin, finish, u, dx * scale_x, margin_x, bounds[slab, 0], nx)
+        begin, finish = _clip(begin, finish, v, dy * scale_y, margin_y, bounds[slab, 1], ny)
+        begin, finish = _clip(begin, finish, w, dz * scale_z, margin_z, bounds[slab, 2], nz)
+        if not begin - slack <= finish + slack:
+            offsets[r + 1] = 0
+            continue
+        # An interval's middle lies within half a step of its place, also where it is clipped.
+        base = near[r] + (first + jitter[r]) * step
         found = 0
-        j = 0
-        while j < counts[r] and found < limit:
+        j = max(int((begin - slack - base) / step) - 1, 0)
+        count = min(counts[r], max(int((finish + slack - base) / step), 0) + 3)
+        while j < count and found < limit:
             index = first + dtype(j)
             start, end = _interval(near[r], jitter[r], step, enter, leave, index)
             middle = (start + end) * half

@@ -1,0 +1,112 @@
+"""A deformation at one time, kept on a lattice: what a whole frame needs of it is computed once."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dnerf.checks import as_box, check_positive
+from dnerf.deformations.base import Deformation, check_positions_times
+from dnerf.kernels import GridLevels, grid_encode
+
+
+class FrameLattice:
+    """The geometry of lattices that stand in for a deformation while a frame is rendered.
+
+    A frame has one time, and displacements vary slowly in space: a lattice of them costs a few thousand evaluations,
+    its samples would cost hundreds of thousands. The map is exact at vertices and linear in between, so the error
+    falls with the square of the cells' size.
+
+    Args:
+        box: (2, 3) corners of the lattice, in world units; outside it the deformation itself is asked.
+        resolution: cells along the box's longest side; cells are nearly cubes.
+
+    Raises:
+        ValueError: for a box that is none or a resolution that is not positive.
+    """
+
+    def __init__(self, box: Sequence[Sequence[float]], resolution: int = 64) -> None:
+        check_positive("resolution", resolution)
+        self.box = as_box(box)
+        sides = self.box[1] - self.box[0]
+        self.cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
+
+    def at_time(self, deformation: Deformation, time: float) -> "FrozenDeformation":
+        """A stand-in for the deformation at one time, in [0, 1]."""
+        return FrozenDeformation(deformation, self, time)
+
+
+class FrozenDeformation(Deformation):
+    """A deformation at one time, seen through a lattice that is filled where positions fall; see `FrameLattice`.
+
+    For rendering: what was computed once is kept, so it knows nothing of later changes of the deformation, and no
+    gradient reaches the deformation.
+
+    Args:
+        deformation: what is asked at vertices.
+        lattice: where they are.
+        time: in [0, 1]; the only one at which it may be called.
+        pad_to: the number of vertices asked is rounded up to a multiple of this, since matrix libraries compile code
+            for every new number of rows.
+    """
+
+    def __init__(self, deformation: Deformation, lattice: FrameLattice, time: float, *, pad_to: int = 2048) -> None:
+        super().__init__()
+        self.deformation = deformation
+        self.time = time
+        self.pad_to = pad_to
+        num_vertices = (lattice.cells[0] + 1) * (lattice.cells[1] + 1) * (lattice.cells[2] + 1)
+        self.levels = GridLevels([lattice.cells], 1 << (num_vertices - 1).bit_length())
+        self.low, self.sides = lattice.box[0], lattice.box[1] - lattice.box[0]
+        self.displacements = torch.zeros(num_vertices, 4)  # four, so that rows are aligned
+        self.is_known = torch.zeros([c + 1 for c in reversed(lattice.cells)], dtype=torch.bool)
+
+    @torch.no_grad()
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Canonical positions (..., 3) of world positions (..., 3) at times (...,).
+
+        Raises:
+            ValueError: for times other than the lattice's.
+        """
+        check_positions_times(positions, times)
+        if not positions.numel():
+            return positions
+        # Padded samples carry the time of a ray too, so all are one.
+        if not bool((times - self.time).abs().amax() < 1e-6):
+            raise ValueError(f"times must all be {self.time}, got values from {times.min()} to {times.max()}")
+        self._to(positions.device)
+        points = positions.reshape(-1, 3)
+        unit = (points - self.low.to(points.dtype)) / self.sides.to(points.dtype)
+        self._fill(unit)
+        moved = points + grid_encode(unit, self.displacements, self.levels)[:, :3].to(points.dtype)
+        outside = ((unit < 0) | (unit > 1)).any(-1)
+        if bool(outside.any()):
+            rest = outside.nonzero()[:, 0]
+            moved[rest] = self.deformation(points[rest], times.reshape(-1)[rest]).to(moved.dtype)
+        return moved.reshape(positions.shape)
+
+    def _to(self, device: torch.device) -> None:
+        if self.displacements.device != device:
+            self.low, self.sides = self.low.to(device), self.sides.to(device)
+            self.displacements, self.is_known = self.displacements.to(device), self.is_known.to(device)
+
+    def _fill(self, unit: Tensor) -> None:
+        """Ask the deformation at the vertices of the points' cells that are not known yet."""
+        size = torch.tensor(self.levels.cells, device=unit.device)
+        lower = (unit.clamp(0, 1) * size.to(unit.dtype)).long().clamp(max=size - 1)
+        needed = torch.zeros_like(self.is_known)
+        needed[lower[:, 2], lower[:, 1], lower[:, 0]] = True
+        for axis in range(3):
+            moved = needed.clone()
+            moved.narrow(axis, 1, needed.shape[axis] - 1).logical_or_(needed.narrow(axis, 0, needed.shape[axis] - 1))
+            needed = moved
+        places = (needed & ~self.is_known).nonzero()
+        if not len(places):
+            return
+        padded = torch.cat([places, places[-1:].expand(-len(places) % self.pad_to, 3)])
+        vertices = self.low + self.sides * padded.flip(-1) / size
+        displaced = self.deformation(vertices, vertices.new_full((len(vertices),), self.time)) - vertices
+        self.displacements.view(*self.is_known.shape, 4)[(*places.unbind(-1),)] = torch.nn.functional.pad(
+            displaced[: len(places)].float(), (0, 1)
+        )
+        self.is_known |= needed

@@ -1,0 +1,108 @@
+"""The lattice that stands in for a deformation while one frame is rendered."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.cameras import Camera, Intrinsics, look_at
+from dnerf.deformations import Deformation, DisplacementDeformation, FrameLattice, IdentityDeformation
+from dnerf.fields import DeformedField, GridField
+from dnerf.renderer import Renderer
+from dnerf.samplers import OccupancySampler, StratifiedSampler
+
+BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5]]
+
+
+class Bend(Deformation):
+    """A smooth map whose second derivatives are at most 0.5, and which counts what it is asked."""
+
+    num_points = 0
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        self.num_points += len(positions)
+        return positions + times[..., None] * torch.sin(positions.roll(1, -1)) * 0.5
+
+
+def points(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
+    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+    low, high = torch.tensor(BOX, dtype=dtype)
+    return torch.lerp(low, high, unit)
+
+
+def error(resolution: int) -> float:
+    bend, x = Bend(), points(4000)
+    times = x.new_full((len(x),), 0.7)
+    return float((FrameLattice(BOX, resolution).at_time(bend, 0.7)(x, times) - bend(x, times)).abs().max())
+
+
+def test_error_falls_with_the_square_of_the_cells_and_stays_below_its_bound() -> None:
+    errors = [error(r) for r in (4, 8, 16)]
+    for resolution, value in zip((4, 8, 16), errors, strict=True):
+        # Linear interpolation along one axis of f with |f''| <= 0.35 (each component bends along one axis).
+        assert value <= 0.35 * (2 / resolution) ** 2 / 8 * 1.001 + 1e-7  # the lattice holds float32
+    assert errors[0] / errors[1] > 3.5
+    assert errors[1] / errors[2] > 3.5
+
+
+def test_vertices_are_exact_and_asked_once() -> None:
+    bend, lattice = Bend(), FrameLattice([[-1.0] * 3, [1.0] * 3], 8)
+    frozen = lattice.at_time(bend, 0.5)
+    frozen.pad_to = 1
+    axis = torch.linspace(-1, 1, 9)
+    vertices = torch.cartesian_prod(axis, axis, axis)
+    times = vertices.new_full((len(vertices),), 0.5)
+    torch.testing.assert_close(frozen(vertices, times), Bend()(vertices, times), rtol=0, atol=2e-7)
+    assert bend.num_points == 9**3
+    frozen(vertices * 0.9, times)
+    assert bend.num_points == 9**3
+
+
+def test_only_cells_with_points_are_asked() -> None:
+    bend = Bend()
+    frozen = FrameLattice(BOX, 64).at_time(bend, 0.5)
+    frozen.pad_to = 1
+    frozen(torch.tensor([[0.01, 0.01, 0.01]]), torch.tensor([0.5]))
+    assert bend.num_points == 8
+    frozen(torch.tensor([[0.04, 0.01, 0.01]]), torch.tensor([0.5]))  # the next cell shares a face
+    assert bend.num_points == 12
+
+
+def test_outside_its_box_the_deformation_itself_is_asked() -> None:
+    x = points(50, 3, torch.float32) * 3
+    times = torch.full((50,), 0.3)
+    outside = (x < torch.tensor(BOX[0])).any(-1) | (x > torch.tensor(BOX[1])).any(-1)
+    frozen = FrameLattice(BOX, 4).at_time(Bend(), 0.3)(x, times)
+    assert outside.any()
+    assert torch.equal(frozen[outside], Bend()(x, times)[outside])
+
+
+def test_shapes_emptiness_and_other_times() -> None:
+    frozen = FrameLattice(BOX, 4).at_time(Bend(), 0.25)
+    assert frozen(torch.zeros(2, 3, 3), torch.full((2, 3), 0.25)).shape == (2, 3, 3)
+    assert frozen(torch.zeros(0, 3), torch.zeros(0)).shape == (0, 3)
+    with pytest.raises(ValueError, match=r"times must all be 0.25"):
+        frozen(torch.zeros(2, 3), torch.tensor([0.25, 0.3]))
+    with pytest.raises(ValueError, match="resolution"):
+        FrameLattice(BOX, 0)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_pictures_hardly_change_and_training_does_not_see_it(packed: bool) -> None:
+    torch.manual_seed(0)
+    deformation = DisplacementDeformation(2, 16, (), position_frequencies=2, time_frequencies=2)
+    torch.nn.init.normal_(deformation.mlp.output.weight, std=0.05)
+    canonical = GridField(BOX, (4, 8), 4, hidden_features=8, density_shift=1.0)
+    exact, cached = (DeformedField(deformation, canonical, frame_lattice=x) for x in (None, FrameLattice(BOX, 32)))
+    sampler = OccupancySampler(BOX, 0.05, 8) if packed else StratifiedSampler(32, box=BOX)
+    camera = Camera(Intrinsics(24, 24, 30.0, 30.0), look_at((0.0, -3.0, 0.5), (0.0, 0.0, 0.0)))
+    pictures = [Renderer(field, sampler).render_image(camera, 0.6).rgb for field in (exact, cached)]
+    assert pictures[0].std() > 0.01
+    torch.testing.assert_close(pictures[0], pictures[1], rtol=0, atol=2e-3)
+    rays = camera.rays(0.6)[:50]
+    seen = [Renderer(field, sampler).eval()(rays).rgb for field in (exact, cached)]
+    assert torch.equal(*seen)
+
+
+def test_what_does_not_move_is_not_cached() -> None:
+    field = DeformedField(IdentityDeformation(), GridField(BOX), frame_lattice=FrameLattice(BOX))
+    assert field.at_time(0.5) is field
