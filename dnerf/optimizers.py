@@ -73,7 +73,7 @@ class AdamMuon(torch.optim.Adam):
         super().__init__(listed, lr=lr, betas=betas, eps=eps, fused=fused)
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One step on all parameters that have a gradient, as of Adam."""
         loss = None
         if closure is not None:
