@@ -172,7 +172,7 @@ def test_evaluation_by_protocol_says_everything_and_makes_tables(work):
     temporal = json.loads((work / "run" / "temporal.json").read_text())
     assert temporal["motion"] == "model"
     assert "track_error" not in temporal
-    rows = json.loads((work / "tables" / "t.json").read_text())
+    rows = json.loads((work / "tables" / "t.json").read_text())["rows"]
     assert [row["method"] for row in rows] == ["tiny", "tiny"]
     table = (work / "tables" / "t.md").read_text()
     assert f"| tiny | lego | val | {metrics['psnr']:.2f} |" in table
