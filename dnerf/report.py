@@ -14,6 +14,16 @@ TYPES = {".mp4": "video/mp4", ".gif": "image/gif", ".png": "image/png"}
 MAX_BYTES = 40 * 2**20
 """Most bytes of films and pictures in one page: mail and chat refuse larger ones."""
 
+FILM_NOTES = {
+    "depth": "expected distance along the ray, in world units",
+    "opacity": "white where light is absorbed, black where it passes",
+    "motion": "hue is the direction and saturation the length of the motion to the next frame, in pixels, the camera's "
+    "included; white stands still, grey is not known",
+    "deformation": "distance between a point and its place in canonical space, in world units",
+    "compare": "prediction, truth, absolute error",
+}
+"""What a film shows, by the end of its file's name."""
+
 TEMPORAL = (
     ("film_psnr", None, "dB, of the film's frames", ".2f"),
     ("temporal_psnr", None, "dB, of frame differences: what is wrong with the change", ".2f"),
@@ -119,7 +129,9 @@ def _check_size(paths: Sequence[Path]) -> None:
 
 def _film(path: Path) -> dict[str, str]:
     kind = "video" if Path(path).suffix.lower() == ".mp4" else "image"
-    return {"uri": data_uri(path), "kind": kind, "caption": Path(path).stem.replace("_", " ")}
+    stem = Path(path).stem
+    note = FILM_NOTES.get(stem.rpartition("_")[2], "")
+    return {"uri": data_uri(path), "kind": kind, "caption": stem.replace("_", " "), "note": note}
 
 
 def _curve(metrics: Mapping[str, Any]) -> dict[str, str]:
@@ -185,10 +197,10 @@ def _temporal(scores: Mapping[str, Any]) -> dict[str, Any]:
     return {"note": f"{film}, {scores.get('resolution', '?')} pixels wide. {source}", "rows": rows}
 
 
-def _table(metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _table(metrics: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
+    """A row per measure and a column per evaluation: there are many of the one and few of the other."""
     columns = [column for column in COLUMNS if any(m.get(column[0]) is not None for m in metrics)]
-    rows = [[_cell(m.get(key), form) for key, _, form in columns] for m in metrics]
-    return {"headings": [heading for _, heading, _ in columns], "rows": rows}
+    return [(heading, [_cell(m.get(key), form) for m in metrics]) for key, heading, form in columns]
 
 
 def _facts(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
