@@ -163,6 +163,13 @@ def table_notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             notes.append(f"Protocol {name}: {known.resolution} pixels wide, on {known.background} ({known.note}).")
         else:
             notes.append(f"Protocol {name}: each run's own pictures and background; not for comparison with papers.")
+    parts = [
+        f"{row['scene']} {row['num_frames']} of {row['frames_of_split']}"
+        for row in rows
+        if row.get("num_frames", 0) < row.get("frames_of_split", 0)
+    ]
+    if parts:
+        notes.append(f"Not all frames were scored, so these rows are not by the protocol: {', '.join(parts)}.")
     missing = missing_scenes(rows)
     if 0 < len(missing) < len(DNERF_SCENES):
         notes.append(f"No mean over eight scenes: {', '.join(missing)} not scored.")

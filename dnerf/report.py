@@ -82,9 +82,9 @@ def write_report_text(
         protocol_note=_protocol_note(first),
         films=[_film(path) for path in films],
         sheets=[{"title": heading, "caption": caption, "uri": data_uri(path)} for heading, caption, path in sheets],
-        curves=[_curve(m) for m in metrics],
+        curves=[_curve(m) for m in metrics if len(m["frames"]) > 1],
         temporal=None if temporal is None else _temporal(temporal),
-        table=_table(metrics),
+        table=_table([{"protocol": "own", **m} for m in metrics]),
         facts=_facts(first),
         frames=_frames(first["frames"]),
         config=config,
@@ -131,7 +131,18 @@ def _film(path: Path) -> dict[str, str]:
     kind = "video" if Path(path).suffix.lower() == ".mp4" else "image"
     stem = Path(path).stem
     note = FILM_NOTES.get(stem.rpartition("_")[2], "")
-    return {"uri": data_uri(path), "kind": kind, "caption": stem.replace("_", " "), "note": note}
+    wide = "wide" if kind == "video" and _is_wide(Path(path).read_bytes()) else ""
+    return {"uri": data_uri(path), "kind": kind, "caption": stem.replace("_", " "), "note": note, "wide": wide}
+
+
+def _is_wide(film: bytes) -> bool:
+    """Whether an MP4 file is more than twice as wide as high, by its first track's header (ISO 14496-12, 8.3.2)."""
+    start = film.find(b"tkhd") + 4
+    if start < 4 or len(film) < start + 96:
+        return False
+    sizes = start + (88 if film[start] == 1 else 76)
+    width, height = (int.from_bytes(film[at : at + 4], "big") for at in (sizes, sizes + 4))
+    return width > 2 * height
 
 
 def _curve(metrics: Mapping[str, Any]) -> dict[str, str]:
@@ -169,10 +180,15 @@ def _protocol_note(metrics: Mapping[str, Any]) -> str:
     size = f"{metrics['resolution']} pixels wide, " if "resolution" in metrics else ""
     background = f"on {metrics['background']}, " if "background" in metrics else ""
     return (
-        f"Means over {metrics['num_frames']} frames of the {metrics['split']} split, "
+        f"Means over {_number_of_frames(metrics)} of the {metrics['split']} split, "
         f"{size}{background}{_protocol(metrics)}. "
         "PSNR is of floats clamped to [0, 1] against 8-bit truths; SSIM has a Gaussian window of 11 pixels."
     )
+
+
+def _number_of_frames(metrics: Mapping[str, Any]) -> str:
+    scored, there = metrics["num_frames"], metrics.get("frames_of_split", metrics["num_frames"])
+    return f"{scored} of the {there} frames" if scored < there else f"all {there} frames"
 
 
 def _temporal(scores: Mapping[str, Any]) -> dict[str, Any]:

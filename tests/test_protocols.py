@@ -96,6 +96,9 @@ def test_notes_say_the_protocol_and_which_scenes_a_mean_lacks() -> None:
     (own,) = table_notes([row("walker", 30.0, protocol="own")])
     assert own.startswith("Protocol own: each run's own")
     assert len(table_notes([row(scene, 30.0) for scene in DNERF_SCENES])) == 1
+    part = table_notes([row("mutant", 30.0, num_frames=2, frames_of_split=20)])[1]
+    assert part == "Not all frames were scored, so these rows are not by the protocol: mutant 2 of 20."
+    assert len(table_notes([row("walker", 30.0, num_frames=20, frames_of_split=20)])) == 1
 
 
 def test_seeds_are_averaged_within_a_scene_first() -> None:

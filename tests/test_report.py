@@ -214,6 +214,17 @@ def test_a_real_browser_shows_everything(tmp_path: Path, width: int, dark: bool)
     assert found["caption"] == "orbit depth: expected distance along the ray, in world units"
 
 
+def test_wide_films_get_the_whole_width_and_one_frame_gets_no_curve(tmp_path: Path) -> None:
+    frames = [torch.rand(32, 96, 3) for _ in range(3)]
+    film = write_frames(frames, tmp_path / "test.mp4", fps=10)
+    assert '<figure class="wide">' in page(tmp_path, films=[film])
+    assert '<figure class="wide">' not in page(tmp_path)
+    one = {**METRICS, "frames": METRICS["frames"][:1], "num_frames": 1, "frames_of_split": 20}
+    text = page(tmp_path, metrics=[one])
+    assert "PSNR over time" not in text
+    assert "Means over 1 of the 20 frames of the test split" in text
+
+
 def test_a_table_has_a_column_per_evaluation(tmp_path: Path) -> None:
     text = page(tmp_path)
     assert re.search(r'<th class="key" scope="row">PSNR</th><td>27.05</td><td>30.12</td></tr>', text)
