@@ -37,6 +37,7 @@ def frame_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], metric: str = 
             ordered = sorted(frames, key=lambda frame: frame["time"])
             times, values = [frame["time"] for frame in ordered], [frame[metric] for frame in ordered]
             axes.plot(times, values, marker="o", markersize=3, linewidth=1.4, label=name, color=COLORS[index % 6])
+        axes.set_xlim(-0.02, 1.02)
         axes.set_xlabel("time")
         axes.set_ylabel(LABELS.get(metric, metric))
         axes.grid(alpha=0.25)

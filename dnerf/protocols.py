@@ -55,6 +55,7 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("psnr", "PSNR", ".2f"),
     ("ssim", "SSIM", ".4f"),
     ("lpips", "LPIPS", ".4f"),
+    ("lpips_backbone", "LPIPS of", ""),
     ("num_frames", "frames", "d"),
     ("resolution", "pixels", "d"),
     ("background", "background", ""),
@@ -70,40 +71,55 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 )
 """Key, heading and format of a table's columns."""
 
+APART = ("method", "protocol", "resolution", "background", "lpips_backbone")
+"""What scores must have in common to be averaged."""
+
+SHARED = ("split", "seed", "num_frames", "num_parameters", "train_hardware", "hardware", "train_commit", "commit")
+"""What a mean says where all that it averages agree."""
+
 MEAN_COLUMNS = ("psnr", "ssim", "lpips", "train_seconds", "seconds_per_frame")
 
 
 def scene_means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Means over scenes per method: over D-NeRF's eight, over the seven without Lego, or over what is there.
 
-    Runs of one scene that differ in the seed are averaged first. The eight- and seven-scene means are given only when
-    all their scenes are; "mean" covers the scenes present if they are neither.
+    Scores that differ in `APART` are never averaged. Runs of one scene that differ in the seed are averaged first. The
+    eight- and seven-scene means are given only when all their scenes are; any other set of at least two is named. A
+    mean also says what its rows have in common (`SHARED`).
 
     Args:
         rows: scores, with the keys of `COLUMNS`.
 
     Returns:
-        Rows whose scene is "mean of 8 (lego: test)", "mean of 7 (without lego)" or "mean of 2 (mutant, trex)".
+        Rows whose scene is "mean of 8 (lego: test)", "mean of 7 (without lego)" or "mean of 2 (lego: val, mutant)".
     """
     means = []
-    for key in dict.fromkeys((row["method"], row["protocol"]) for row in rows):
+    for key in dict.fromkeys(tuple(row.get(name) for name in APART) for row in rows):
         by_scene: dict[str, list[Mapping[str, Any]]] = {}
         for row in rows:
-            if (row["method"], row["protocol"]) == key:
+            if tuple(row.get(name) for name in APART) == key:
                 by_scene.setdefault(row["scene"], []).append(row)
         eight, seven = set(DNERF_SCENES), set(DNERF_SCENES) - {LEGO}
+        lego = f"{LEGO}: {'/'.join(sorted({row['split'] for row in by_scene.get(LEGO, ())}))}"
         groups: list[tuple[str, list[str]]] = []
         if eight <= by_scene.keys():
-            splits = "/".join(sorted({row["split"] for row in by_scene[LEGO]}))
-            groups.append((f"mean of 8 (lego: {splits})", sorted(eight)))
+            groups.append((f"mean of 8 ({lego})", sorted(eight)))
         if seven <= by_scene.keys():
             groups.append(("mean of 7 (without lego)", sorted(seven)))
         present = sorted(by_scene)
         if len(present) > 1 and set(present) not in (eight, seven):
-            groups.append((f"mean of {len(present)} ({', '.join(present)})", present))
+            named = ", ".join(lego if scene == LEGO else scene for scene in present)
+            groups.append((f"mean of {len(present)} ({named})", present))
         for title, scenes in groups:
-            means.append({"method": key[0], "protocol": key[1], "scene": title, **_means(by_scene, scenes)})
+            shared = {name: value for name, value in zip(APART, key) if value is not None}
+            means.append({**shared, "scene": title, **_shared(by_scene, scenes), **_means(by_scene, scenes)})
     return means
+
+
+def _shared(by_scene: Mapping[str, Sequence[Mapping[str, Any]]], scenes: Sequence[str]) -> dict[str, Any]:
+    listed = [row for scene in scenes for row in by_scene[scene]]
+    values = {name: {row.get(name) for row in listed} for name in SHARED}
+    return {name: found.pop() for name, found in values.items() if len(found) == 1 and None not in found}
 
 
 def _means(by_scene: Mapping[str, Sequence[Mapping[str, Any]]], scenes: Sequence[str]) -> dict[str, float]:
@@ -131,6 +147,33 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in listed:
         lines.append("| " + " | ".join(_cell(row.get(key), kind) for key, _, kind in columns) + " |")
     return "\n".join(lines) + "\n"
+
+
+def table_json(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The same rows and means as plain values, and the scenes of D-NeRF's eight that are not among them."""
+    return {"rows": [dict(row) for row in rows], "means": scene_means(rows), "missing": missing_scenes(rows)}
+
+
+def table_notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What a reader of the table has to know: what its protocols mean, and why a mean is not there."""
+    notes = []
+    for name in dict.fromkeys(row["protocol"] for row in rows):
+        if name in PROTOCOLS:
+            known = PROTOCOLS[name]
+            notes.append(f"Protocol {name}: {known.resolution} pixels wide, on {known.background} ({known.note}).")
+        else:
+            notes.append(f"Protocol {name}: each run's own pictures and background; not for comparison with papers.")
+    parts = [
+        f"{row['scene']} {row['num_frames']} of {row['frames_of_split']}"
+        for row in rows
+        if row.get("num_frames", 0) < row.get("frames_of_split", 0)
+    ]
+    if parts:
+        notes.append(f"Not all frames were scored, so these rows are not by the protocol: {', '.join(parts)}.")
+    missing = missing_scenes(rows)
+    if 0 < len(missing) < len(DNERF_SCENES):
+        notes.append(f"No mean over eight scenes: {', '.join(missing)} not scored.")
+    return notes
 
 
 def csv_table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -14,6 +14,16 @@ TYPES = {".mp4": "video/mp4", ".gif": "image/gif", ".png": "image/png"}
 MAX_BYTES = 40 * 2**20
 """Most bytes of films and pictures in one page: mail and chat refuse larger ones."""
 
+FILM_NOTES = {
+    "depth": "expected distance along the ray, in world units",
+    "opacity": "white where light is absorbed, black where it passes",
+    "motion": "hue is the direction and saturation the length of the motion to the next frame, in pixels, the camera's "
+    "included; white stands still, grey is not known",
+    "deformation": "distance between a point and its place in canonical space, in world units",
+    "compare": "prediction, truth, absolute error",
+}
+"""What a film shows, by the end of its file's name."""
+
 TEMPORAL = (
     ("film_psnr", None, "dB, of the film's frames", ".2f"),
     ("temporal_psnr", None, "dB, of frame differences: what is wrong with the change", ".2f"),
@@ -72,9 +82,9 @@ def write_report_text(
         protocol_note=_protocol_note(first),
         films=[_film(path) for path in films],
         sheets=[{"title": heading, "caption": caption, "uri": data_uri(path)} for heading, caption, path in sheets],
-        curves=[_curve(m) for m in metrics],
+        curves=[_curve(m) for m in metrics if len(m["frames"]) > 1],
         temporal=None if temporal is None else _temporal(temporal),
-        table=_table(metrics),
+        table=_table([{"protocol": "own", **m} for m in metrics]),
         facts=_facts(first),
         frames=_frames(first["frames"]),
         config=config,
@@ -119,7 +129,20 @@ def _check_size(paths: Sequence[Path]) -> None:
 
 def _film(path: Path) -> dict[str, str]:
     kind = "video" if Path(path).suffix.lower() == ".mp4" else "image"
-    return {"uri": data_uri(path), "kind": kind, "caption": Path(path).stem.replace("_", " ")}
+    stem = Path(path).stem
+    note = FILM_NOTES.get(stem.rpartition("_")[2], "")
+    wide = "wide" if kind == "video" and _is_wide(Path(path).read_bytes()) else ""
+    return {"uri": data_uri(path), "kind": kind, "caption": stem.replace("_", " "), "note": note, "wide": wide}
+
+
+def _is_wide(film: bytes) -> bool:
+    """Whether an MP4 file is more than twice as wide as high, by its first track's header (ISO 14496-12, 8.3.2)."""
+    start = film.find(b"tkhd") + 4
+    if start < 4 or len(film) < start + 96:
+        return False
+    sizes = start + (88 if film[start] == 1 else 76)
+    width, height = (int.from_bytes(film[at : at + 4], "big") for at in (sizes, sizes + 4))
+    return width > 2 * height
 
 
 def _curve(metrics: Mapping[str, Any]) -> dict[str, str]:
@@ -157,10 +180,15 @@ def _protocol_note(metrics: Mapping[str, Any]) -> str:
     size = f"{metrics['resolution']} pixels wide, " if "resolution" in metrics else ""
     background = f"on {metrics['background']}, " if "background" in metrics else ""
     return (
-        f"Means over {metrics['num_frames']} frames of the {metrics['split']} split, "
+        f"Means over {_number_of_frames(metrics)} of the {metrics['split']} split, "
         f"{size}{background}{_protocol(metrics)}. "
         "PSNR is of floats clamped to [0, 1] against 8-bit truths; SSIM has a Gaussian window of 11 pixels."
     )
+
+
+def _number_of_frames(metrics: Mapping[str, Any]) -> str:
+    scored, there = metrics["num_frames"], metrics.get("frames_of_split", metrics["num_frames"])
+    return f"{scored} of the {there} frames" if scored < there else f"all {there} frames"
 
 
 def _temporal(scores: Mapping[str, Any]) -> dict[str, Any]:
@@ -185,10 +213,10 @@ def _temporal(scores: Mapping[str, Any]) -> dict[str, Any]:
     return {"note": f"{film}, {scores.get('resolution', '?')} pixels wide. {source}", "rows": rows}
 
 
-def _table(metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _table(metrics: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
+    """A row per measure and a column per evaluation: there are many of the one and few of the other."""
     columns = [column for column in COLUMNS if any(m.get(column[0]) is not None for m in metrics)]
-    rows = [[_cell(m.get(key), form) for key, _, form in columns] for m in metrics]
-    return {"headings": [heading for _, heading, _ in columns], "rows": rows}
+    return [(heading, [_cell(m.get(key), form) for m in metrics]) for key, heading, form in columns]
 
 
 def _facts(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -19,7 +19,7 @@ from dnerf.files import write_json, write_text
 from dnerf.logs import SHEET_COLUMNS
 from dnerf.metrics.perceptual import lpips_metric
 from dnerf.plots import frame_curves
-from dnerf.protocols import LEGO, Protocol, csv_table, find_protocol, markdown_table, missing_scenes
+from dnerf.protocols import LEGO, Protocol, csv_table, find_protocol, markdown_table, table_json, table_notes
 from dnerf.provenance import provenance
 from dnerf.renderer import Renderer
 from dnerf.temporal_evaluation import evaluate_over_time
@@ -150,14 +150,11 @@ def _write_temporal(
 def _write_tables(config: DictConfig, runs: list[str], rows: list[dict[str, Any]]) -> None:
     path = Path(config.table or Path(runs[0]).parent / f"table_{config.protocol or 'own'}")
     listed = [{name: value for name, value in row.items() if name != "frames"} for row in rows]
-    table = markdown_table(listed)
+    table = "\n".join([markdown_table(listed), *(f"{note}\n" for note in table_notes(listed))])
     write_text(path.with_name(f"{path.name}.md"), table)
     write_text(path.with_name(f"{path.name}.csv"), csv_table(listed))
-    write_json(path.with_name(f"{path.name}.json"), listed)
+    write_json(path.with_name(f"{path.name}.json"), table_json(listed))
     print(f"\n{table}")
-    missing = missing_scenes(rows)
-    if len(missing) < 8 and missing:
-        print(f"no eight-scene mean: {', '.join(missing)} not scored")
     if config.plots:
         names = [f"{row['method']}: {row['scene']}" for row in rows]
         unique = [f"{name} ({Path(run).name})" if names.count(name) > 1 else name for name, run in zip(names, runs)]

@@ -110,7 +110,10 @@ def _views(config: DictConfig, frames: Frames, device: torch.device) -> list[Vie
     own_times: list[float] | None = None
     if config.path.name == "keyframes":
         keys = read_key_frames(config.path.file)
-        poses, times, angles = keys.sample(config.fps)
+        try:
+            poses, times, angles = keys.sample(config.fps)
+        except ValueError as error:
+            raise ValueError(f"{config.path.file}: {error}") from error
         own_times = times if "time" in keys.channels else None
     elif config.path.name == "test":
         poses, own_times = frames.poses, frames.times.tolist()

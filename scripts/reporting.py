@@ -63,6 +63,7 @@ def evaluate_run(
     metrics = {
         **evaluation.as_dict(),
         **training,
+        "frames_of_split": len(frames),
         "resolution": frames.intrinsics.width,
         "background": _color_name(renderer),
         **(settings or {}),

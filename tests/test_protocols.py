@@ -11,6 +11,8 @@ from dnerf.protocols import (
     markdown_table,
     missing_scenes,
     scene_means,
+    table_json,
+    table_notes,
 )
 
 
@@ -56,6 +58,47 @@ def test_seven_scenes_have_their_mean_and_other_sets_are_named() -> None:
     assert scene_means([row("mutant", 30.0)]) == []
     assert "lego" in missing_scenes(two)
     assert missing_scenes([row(s, 1.0) for s in DNERF_SCENES]) == []
+
+
+def test_a_mean_of_other_scenes_says_which_split_lego_used() -> None:
+    rows = [row("mutant", 30.0), row("lego", 22.0, split="val"), row("trex", 32.0)]
+    assert [mean["scene"] for mean in scene_means(rows)] == ["mean of 3 (lego: val, mutant, trex)"]
+
+
+def test_pictures_of_other_sizes_backgrounds_and_backbones_are_never_averaged() -> None:
+    for name, values in (("resolution", (400, 800)), ("background", ("white", "black")),
+                         ("lpips_backbone", ("alex", "vgg"))):  # fmt: skip
+        rows = [row(scene, 30.0, **{name: value}) for value in values for scene in ("mutant", "trex")]
+        assert [mean[name] for mean in scene_means(rows)] == list(values)
+        assert scene_means([row("mutant", 30.0, **{name: values[0]}), row("trex", 32.0, **{name: values[1]})]) == []
+
+
+def test_means_say_what_their_rows_share() -> None:
+    rows = [row("mutant", 30.0, seed=0, hardware="A", commit="1"), row("trex", 32.0, seed=0, hardware="A", commit="2")]
+    (mean,) = scene_means(rows)
+    assert (mean["split"], mean["seed"], mean["hardware"]) == ("test", 0, "A")
+    assert "commit" not in mean
+
+
+def test_json_holds_rows_means_and_what_is_missing() -> None:
+    table = table_json([row(s, p) for s, p in PUBLISHED.items() if s != "lego"])
+    assert len(table["rows"]) == 7
+    assert [mean["scene"] for mean in table["means"]] == ["mean of 7 (without lego)"]
+    assert table["missing"] == ["lego"]
+
+
+def test_notes_say_the_protocol_and_which_scenes_a_mean_lacks() -> None:
+    first, second = table_notes([row("mutant", 30.0), row("lego", 22.0)])
+    assert first.startswith("Protocol dnerf: 400 pixels wide, on white")
+    assert (
+        second == "No mean over eight scenes: bouncingballs, hellwarrior, hook, jumpingjacks, standup, trex not scored."
+    )
+    (own,) = table_notes([row("walker", 30.0, protocol="own")])
+    assert own.startswith("Protocol own: each run's own")
+    assert len(table_notes([row(scene, 30.0) for scene in DNERF_SCENES])) == 1
+    part = table_notes([row("mutant", 30.0, num_frames=2, frames_of_split=20)])[1]
+    assert part == "Not all frames were scored, so these rows are not by the protocol: mutant 2 of 20."
+    assert len(table_notes([row("walker", 30.0, num_frames=20, frames_of_split=20)])) == 1
 
 
 def test_seeds_are_averaged_within_a_scene_first() -> None:

@@ -27,7 +27,8 @@ def lpips_metric(backbone: str = "alex", *, download: bool = False) -> Callable[
         A function of prediction and target, (H, W, 3) in [0, 1], that returns a number; the prediction is clamped.
 
     Raises:
-        ValueError: saying what to do, if the extra is not installed or the weights are not at hand.
+        ValueError: saying what to do, if the extra is not installed, torchvision is of another build than torch, or
+            the weights are not at hand, cannot be fetched or are damaged.
     """
     check_choice("backbone", backbone, tuple(BACKBONES))
     try:
@@ -35,13 +36,28 @@ def lpips_metric(backbone: str = "alex", *, download: bool = False) -> Callable[
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     except ImportError as error:
         raise ValueError("lpips needs the extra: pip install 'dnerf[lpips]'") from error
+    except RuntimeError as error:  # torch of one build (CPU) and torchvision of another (CUDA)
+        reason = str(error).partition("\n")[0]
+        raise ValueError(
+            f"lpips: torchvision does not fit torch {torch.__version__} ({reason}); "
+            "install both from the same index, for the same device"
+        ) from error
     weights = Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[backbone]
     if not weights.is_file() and not download:
         raise ValueError(
             f"lpips: the weights of {backbone} are not at hand; put {BACKBONES[backbone]} into {weights.parent} "
             "or allow the download with lpips.download=true"
         )
-    network = LearnedPerceptualImagePatchSimilarity(net_type=backbone, normalize=True).eval()  # type: ignore[arg-type]
+    try:
+        network = LearnedPerceptualImagePatchSimilarity(net_type=backbone, normalize=True)  # type: ignore[arg-type]
+    except Exception as error:
+        # What a truncated file raises depends on where it ends.
+        what = "read" if weights.is_file() else "fetched"
+        raise ValueError(
+            f"lpips: the weights of {backbone} could not be {what} ({error}); put a whole {BACKBONES[backbone]} "
+            f"into {weights.parent}"
+        ) from error
+    network.eval()
 
     @torch.no_grad()
     def distance(prediction: Tensor, target: Tensor) -> float:

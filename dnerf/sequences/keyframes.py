@@ -61,7 +61,7 @@ class KeyFrames:
         """Poses (F, 4, 4), times (F) in [0, 1] and horizontal fields of view in radians (F, None: the data's own).
 
         Raises:
-            ValueError: if the eye meets its target or looks straight up or down.
+            ValueError: naming the moment, if the eye meets its target or looks straight up or down.
         """
         at = self.seconds[0] + torch.arange(self.num_frames(fps), dtype=torch.float64) / fps
         targets = self._curve("target", at)
@@ -74,12 +74,17 @@ class KeyFrames:
                 [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1
             )
             eyes = targets + radius[:, None] * around
-        poses = torch.stack([look_at(eye, target) for eye, target in zip(eyes.tolist(), targets.tolist())])
+        poses = []
+        for moment, eye, target in zip(at.tolist(), eyes.tolist(), targets.tolist()):
+            try:
+                poses.append(look_at(eye, target))
+            except ValueError as error:
+                raise ValueError(f"keyframes at {moment:.3g} seconds: {error}") from error
         times = self._curve("time", at)[:, 0].clamp(0, 1).tolist()
         angles: list[float | None] = [None] * len(at)
         if "field_of_view" in self.channels:
             angles = list(torch.deg2rad(self._curve("field_of_view", at)[:, 0]).tolist())
-        return poses, times, angles
+        return torch.stack(poses), times, angles
 
     def _curve(self, name: str, at: Tensor) -> Tensor:
         if name not in self.channels:

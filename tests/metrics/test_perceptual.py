@@ -1,7 +1,9 @@
 """LPIPS is an extra whose absence is explained; with its library and weights at hand it is a distance."""
 
 import builtins
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -20,6 +22,40 @@ def test_a_missing_extra_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(builtins, "__import__", without_torchvision)
     with pytest.raises(ValueError, match=r"lpips needs the extra: pip install 'dnerf\[lpips\]'"):
         lpips_metric()
+
+
+def test_a_torchvision_of_another_build_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyPI's torchvision next to a CPU torch: its import raises RuntimeError, not ImportError."""
+    real = builtins.__import__
+
+    def broken_torchvision(name: str, *arguments: object, **options: object) -> object:
+        if name == "torchvision":
+            raise RuntimeError("operator torchvision::nms does not exist")
+        return real(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", broken_torchvision)
+    with pytest.raises(ValueError, match=r"torchvision does not fit torch .*nms does not exist.*same index"):
+        lpips_metric()
+
+
+@pytest.mark.parametrize(("at_hand", "said"), [(True, "read"), (False, "fetched")])
+def test_damaged_and_unreachable_weights_are_explained(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, at_hand: bool, said: str
+) -> None:
+    class Network:
+        def __init__(self, **options: object) -> None:
+            raise OSError("no route to host")
+
+    modules = {"torchvision": SimpleNamespace(), "torchmetrics.image.lpip": SimpleNamespace()}
+    modules["torchmetrics.image.lpip"].LearnedPerceptualImagePatchSimilarity = Network
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    if at_hand:
+        (tmp_path / "checkpoints").mkdir()
+        (tmp_path / "checkpoints" / BACKBONES["alex"]).write_bytes(b"PK")
+    with pytest.raises(ValueError, match=rf"could not be {said} \(no route to host\); put a whole {BACKBONES['alex']}"):
+        lpips_metric(download=not at_hand)
 
 
 def test_missing_weights_are_explained_and_never_fetched(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

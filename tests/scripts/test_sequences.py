@@ -118,6 +118,12 @@ def test_key_frames_make_a_film_at_their_own_pace(work):
         assert arrays["intrinsics"][0, 2] == pytest.approx(arrays["intrinsics"][0, 3]), "pixels stay square"
 
 
+def test_a_camera_that_key_frames_misplace_is_named_with_its_file(work):
+    (work / "inside.json").write_text(json.dumps({"keyframes": [{"seconds": 0, "eye": [0, 0, 0]}]}))
+    with pytest.raises(ValueError, match=r"inside.json: keyframes at 0 seconds: eye must differ from target"):
+        call("render", "run=run", "path=keyframes", "path.file=inside.json")
+
+
 def test_outputs_and_slow_motion(work):
     call(
         "render",
@@ -172,7 +178,7 @@ def test_evaluation_by_protocol_says_everything_and_makes_tables(work):
     temporal = json.loads((work / "run" / "temporal.json").read_text())
     assert temporal["motion"] == "model"
     assert "track_error" not in temporal
-    rows = json.loads((work / "tables" / "t.json").read_text())
+    rows = json.loads((work / "tables" / "t.json").read_text())["rows"]
     assert [row["method"] for row in rows] == ["tiny", "tiny"]
     table = (work / "tables" / "t.md").read_text()
     assert f"| tiny | lego | val | {metrics['psnr']:.2f} |" in table

@@ -106,3 +106,9 @@ def test_absurdly_long_films_are_refused() -> None:
     frames = parse_key_frames(keys({"seconds": 0}, {"seconds": 1e9}))
     with pytest.raises(ValueError, match="keyframes last 30000000001 frames"):
         frames.sample(30)
+
+
+def test_the_moment_at_which_the_eye_meets_its_target_is_named() -> None:
+    frames = parse_key_frames(keys({"seconds": 0, "eye": [-2, 0, 0]}, {"seconds": 2, "eye": [2, 0, 0]}))
+    with pytest.raises(ValueError, match="keyframes at 1 seconds: eye must differ from target"):
+        frames.sample(4)
