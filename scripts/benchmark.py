@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
         options=options,
     )
     with num_threads(threads):
-        machine = describe_machine(device)
+        machine = describe_machine()
         result = run_suite(config.suite, settings)
     command = shlex.join(["python", "scripts/benchmark.py", *sys.argv[1:]])
     date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -48,8 +48,8 @@ def test_memory_is_that_of_this_child_alone(command, tmp_path):
 
 
 def test_a_run_of_the_same_clean_commit_is_not_repeated(command, tmp_path, monkeypatch):
-    for commit, expected in (("abc", 1), ("abc", 1), ("def", 2), ("def + changes", 3), ("def + changes", 4)):
-        monkeypatch.setattr(runs, "describe_machine", lambda commit=commit: {"commit": commit})
+    for commit, expected in (("abc", 1), ("abc", 1), ("def", 2), ("def-dirty", 3), ("def-dirty", 4)):
+        monkeypatch.setattr(runs, "commit", lambda commit=commit: commit)
         assert run_training(command, ["seed=2"], tmp_path / "run").psnr == 23
         assert len((tmp_path / "calls.txt").read_text().splitlines()) == expected
 
