@@ -1,15 +1,14 @@
 """What a flow costs and how right it is: solvers and variants. Each function returns rows of a table."""
 
 import math
-import time
 from collections.abc import Callable, Sequence
-from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dnerf.benchmarks.closed_flows import CLOSED_FLOWS, ClosedFlow
+from dnerf.benchmarks.timing import Timing, time_in_turn
 from dnerf.checks import check_positive
 from dnerf.deformations import (
     Deformation,
@@ -29,16 +28,9 @@ STEPS = (1, 2, 4, 8, 16, 32)
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
 
-def milliseconds(function: Callable[[], object], repeats: int) -> float:
-    """Median wall-clock milliseconds of a call, after one that is not counted; waits for the GPU if there is one."""
-    durations = []
-    for _ in range(repeats + 1):
-        begin = time.perf_counter()
-        function()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        durations.append(1e3 * (time.perf_counter() - begin))
-    return median(durations[1:])
+def timed(function: Callable[[], object], repeats: int, device: str) -> Timing:
+    """Median and quartiles of a call's time, after one that is not counted."""
+    return time_in_turn({"call": function}, seconds=1e-9, min_repeats=repeats, device=device)["call"]
 
 
 def smooth_network() -> NetworkVelocity:
@@ -74,8 +66,9 @@ def solver_rows(
         device: where to compute.
 
     Returns:
-        Rows of field, solver, setting, evaluations, milliseconds, max_error, mean_error and round_trip (largest
-        distance after the way there and the uncorrected way back, infinite if that fails), in world units.
+        Rows of field, solver, setting, evaluations, milliseconds (median_ms and the quartiles low_ms and high_ms),
+        max_error, mean_error and round_trip (largest distance after the way there and the uncorrected way back,
+        infinite if that fails), in world units.
     """
     check_positive("num_points", num_points)
     check_positive("repeats", repeats)
@@ -115,13 +108,13 @@ def _truth(velocity: Velocity, positions: Tensor, times: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _measure(flow: FlowDeformation, positions: Tensor, times: Tensor, truth: Tensor, repeats: int) -> Row:
-    duration = milliseconds(lambda: flow(positions, times), repeats)
+    timing = timed(lambda: flow(positions, times), repeats, positions.device.type)
     evaluations = flow.evaluations.last
     carried = flow(positions, times)
     errors = (carried - truth).norm(dim=-1)
     return {
         "evaluations": evaluations,
-        "milliseconds": duration,
+        **timing.milliseconds,
         "max_error": float(errors.max()),
         "mean_error": float(errors.mean()),
         "round_trip": _round_trip(flow, carried, times, positions),
@@ -193,7 +186,7 @@ def variant_rows(
 
     Returns:
         Rows of variant, evaluations, points (integrated: samples, or vertices of a lattice), forward_ms, training_ms
-        (forward and backward) and ratio (of training_ms to the first row's).
+        (forward and backward, median and quartiles) and ratio (of training_ms to the first row's).
     """
     made = variants()
     unknown = set(names) - set(made)
@@ -217,8 +210,8 @@ def variant_rows(
             forward().sum().backward()
 
         with torch.no_grad():
-            forward_ms = milliseconds(forward, repeats)
-        training_ms = milliseconds(step, repeats)
+            forward_time = timed(forward, repeats, device)
+        training = timed(step, repeats, device)
         flow = deformation.flow if isinstance(deformation, LatticeFlow | SkippingFlow) else deformation
         points = num_samples
         if isinstance(deformation, LatticeFlow):
@@ -230,9 +223,11 @@ def variant_rows(
                 "variant": name,
                 "evaluations": flow.evaluations.last if isinstance(flow, FlowDeformation) else 1,
                 "points": points,
-                "forward_ms": forward_ms,
-                "training_ms": training_ms,
-                "ratio": training_ms / (rows[0]["training_ms"] if rows else training_ms),
+                "forward_ms": 1e3 * forward_time.median,
+                "training_ms": 1e3 * training.median,
+                "training_low_ms": 1e3 * training.low,
+                "training_high_ms": 1e3 * training.high,
+                "ratio": 1e3 * training.median / (rows[0]["training_ms"] if rows else 1e3 * training.median),
             }
         )
     return rows

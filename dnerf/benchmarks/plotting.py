@@ -11,7 +11,7 @@ from dnerf.files import atomic_path
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5195", "#4D4D4D", "#8C6D31", "#B22222")
 """Okabe and Ito's colours, which the colour-blind tell apart, and four more."""
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-STYLES = ("line", "points", "guide")
+STYLES = ("line", "dashed", "points", "guide")
 
 
 def draw(plot: Plot | BarPlot, path: Path) -> None:
@@ -85,19 +85,23 @@ def _draw_series(axes: Any, series: Series, index: int) -> tuple[float, float, s
     if not points:
         return None
     xs, ys, kept = zip(*points)
+    index = index if series.color is None else series.color
     color = "#999999" if series.style == "guide" else COLORS[index % len(COLORS)]
     if series.style == "guide":
         axes.plot(xs, ys, color=color, linestyle="--", linewidth=1.0, zorder=1)
     else:
-        line = "-" if series.style == "line" else "none"
+        line = {"line": "-", "dashed": (0, (4, 2)), "points": "none"}[series.style]
         marker = MARKERS[index % len(MARKERS)]
         axes.plot(xs, ys, color=color, linestyle=line, linewidth=1.8, marker=marker, markersize=5.5, zorder=3)
     if series.low is not None and series.high is not None:
         low, high = ([values[k] for k in kept] for values in (series.low, series.high))
-        if series.style == "line" and len(xs) > 1:
+        if series.style in ("line", "dashed") and len(xs) > 1:
             axes.fill_between(xs, low, high, color=color, alpha=0.15, linewidth=0, zorder=2)
         else:
             axes.vlines(xs, low, high, color=color, alpha=0.6, linewidth=1.5, zorder=2)
+    if series.x_low is not None and series.x_high is not None:
+        low, high = ([values[k] for k in kept] for values in (series.x_low, series.x_high))
+        axes.hlines(ys, low, high, color=color, alpha=0.35, linewidth=3.5, zorder=2)
     for x, y, k in zip(xs, ys, kept):
         if series.notes is not None and series.notes[k]:
             axes.annotate(
