@@ -111,7 +111,7 @@ def _rows(name: str, part: Part, settings: Settings) -> list[dict[str, Any]]:
 
         calls[precision] = call
     results = {precision: call() for precision, call in calls.items()}
-    timings = time_in_turn(calls, seconds=0.3 if settings.quick else 2.0, min_repeats=3)
+    timings = time_in_turn(calls, seconds=0.3 if settings.quick else 1.5, min_repeats=3)
     truth = results["float64"]
     return [_row(name, p, results[p], truth, timings[p], timings["float32"]) for p in PRECISIONS]
 

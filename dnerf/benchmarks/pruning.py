@@ -140,7 +140,7 @@ def _measure(
     difference = (call() - reference).abs()
     error = float(difference.square().mean())
     timing = time_in_turn(
-        {"call": call}, seconds=0.1 if settings.quick else 2.0, min_repeats=2 if settings.quick else 3,
+        {"call": call}, seconds=0.1 if settings.quick else 1.0, min_repeats=2 if settings.quick else 3,
         device=settings.device,
     )["call"]  # fmt: skip
     samples = sum(_num_samples(renderer, sampler, frames, i) for i in chosen)
