@@ -1,6 +1,7 @@
 """Plots that read without the text: units on the axes, every line labelled where it ends."""
 
 import math
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,10 @@ def draw(plot: Plot | BarPlot, path: Path) -> None:
         ValueError: without matplotlib, without a series, or for an unknown style.
     """
     pyplot = _pyplot()
-    figure, axes = pyplot.subplots(figsize=(8.4, 5.0), dpi=120, layout="constrained")
+    height = 5.0
+    if isinstance(plot, BarPlot):
+        height = max(height, 1.2 + 0.24 * len(plot.categories) * max(len(plot.values), 2))
+    figure, axes = pyplot.subplots(figsize=(8.4, height), dpi=120, layout="constrained")
     try:
         axes.set_title(plot.title, loc="left", fontsize=12, fontweight="bold")
         axes.set_xlabel(plot.x_label)
@@ -59,7 +63,7 @@ def _draw_bars(figure: Any, axes: Any, plot: BarPlot) -> None:
         bars = axes.barh(places, lengths, 0.92 * height, color=COLORS[index % len(COLORS)], label=label)
         texts = [f" {length:.3g}" if math.isfinite(length) else "" for length in lengths]
         axes.bar_label(bars, texts, fontsize=8)
-    axes.set_yticks(range(len(plot.categories)), plot.categories)
+    axes.set_yticks(range(len(plot.categories)), [textwrap.fill(text, 36) for text in plot.categories])
     axes.invert_yaxis()
     if plot.log:
         axes.set_xscale("log")
