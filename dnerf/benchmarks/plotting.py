@@ -61,7 +61,7 @@ def _draw_bars(figure: Any, axes: Any, plot: BarPlot) -> None:
     for index, (label, lengths) in enumerate(plot.values.items()):
         places = [k - 0.4 + (index + 0.5) * height for k in range(len(plot.categories))]
         bars = axes.barh(places, lengths, 0.92 * height, color=COLORS[index % len(COLORS)], label=label)
-        texts = [f" {length:.3g}" if math.isfinite(length) else "" for length in lengths]
+        texts = [f" {length:.2g}" if math.isfinite(length) else "" for length in lengths]
         axes.bar_label(bars, texts, fontsize=8)
     axes.set_yticks(range(len(plot.categories)), [textwrap.fill(text, 36) for text in plot.categories])
     axes.invert_yaxis()
