@@ -22,6 +22,7 @@ KNOBS = {
     "resolution": "occupancy cells along the longest side",
     "slabs": "occupancy slabs of time",
     "cut-off": "transmittance at which a ray ends",
+    "step": "step along a ray (world units)",
 }
 
 
@@ -58,8 +59,10 @@ def run(settings: Settings) -> SuiteResult:
             f"{resolution} pixels rendered in evaluation mode with every setting of one knob at a time. Occupancy "
             "grids are filled from the finished field (`OccupancySampler.fill`, random probes of every cell), so that "
             "their error is what a setting loses; `as trained` is the grid that training left behind. The "
-            "reference samples the whole box at the same step and leaves out nothing: errors are of pruning alone, "
-            "not of the model."
+            f"reference samples the whole box at the trained step, {trained.step_size:g}, and leaves out nothing: "
+            "errors are of pruning alone, not of the model. The experiment's own settings: threshold "
+            f"{trained.threshold:g}, {int(trained.shape[1:].max())} cells, {int(trained.shape[0])} slabs, cut-off "
+            f"{renderer.stop_transmittance:g}."
         ),
         tables=[
             Table(
@@ -74,9 +77,11 @@ def run(settings: Settings) -> SuiteResult:
     )
 
 
-def _grid(trained: OccupancySampler, *, resolution: int, num_slabs: int, threshold: float = 1.0) -> OccupancySampler:
+def _grid(
+    trained: OccupancySampler, *, resolution: int, num_slabs: int, threshold: float = 1.0, step: float | None = None
+) -> OccupancySampler:
     grid = OccupancySampler(
-        trained.box.tolist(), trained.step_size, resolution, num_slabs=num_slabs, threshold=threshold,
+        trained.box.tolist(), step or trained.step_size, resolution, num_slabs=num_slabs, threshold=threshold,
         margin=trained.margin, pad_to=trained.pad_to,
     )  # fmt: skip
     return grid.to(trained.box.device).eval()
@@ -108,6 +113,8 @@ def _settings(
         yield "resolution", value, filled(resolution=value), 0.0
     for value in options["slabs"][few]:
         yield "slabs", value, filled(num_slabs=value), 0.0
+    for value in options["steps"][few]:
+        yield "step", value, filled(step=value), 0.0
     for value in options["cuts"][few]:
         yield "cut-off", value, trained, value
 
@@ -170,7 +177,9 @@ def _plot(rows: list[dict[str, Any]]) -> Plot:
         x, y = [row["median_ms"] for row in part], [max(row["rms_error"], FLOOR) for row in part]
         notes = ["" if row["value"] is None else f"{row['value']:g}" for row in part]
         label = KNOBS.get(knob, knob)
-        series.append(Series(label, x, y, notes=notes, style="points" if len(part) == 1 else "line"))
+        low, high = ([row[end] for row in part] for end in ("low_ms", "high_ms"))
+        style = "points" if len(part) == 1 else "line"
+        series.append(Series(label, x, y, x_low=low, x_high=high, notes=notes, style=style))
     return Plot(
         name="pruning",
         title="Error that pruning introduces against the time of a frame",
