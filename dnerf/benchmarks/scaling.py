@@ -18,9 +18,9 @@ from dnerf.rays import Rays
 from dnerf.samplers import OccupancySampler
 
 KNOBS: dict[str, tuple[str, list[float]]] = {
-    "occupancy_resolution": ("occupancy cells along a side", [16, 32, 64, 128]),
-    "grid_resolution": ("finest feature grid's cells along a side", [32, 64, 128, 256, 512]),
-    "rays": ("rays in the batch", [1024, 4096, 16384, 65536]),
+    "occupancy_resolution": ("occupancy cells along a side", [32, 64, 128]),
+    "grid_resolution": ("finest feature grid's cells along a side", [32, 128, 512]),
+    "rays": ("rays in the batch", [1024, 4096, 16384]),
     "extent": ("side of the box (world units)", [3.0, 6.0, 12.0, 24.0]),
     "occupied": ("radius of the body (world units)", [0.15, 0.3, 0.6, 1.2]),
 }
