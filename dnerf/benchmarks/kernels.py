@@ -270,7 +270,7 @@ def _findings(rows: list[dict[str, Any]]) -> list[str]:
     findings = []
     for kernel, direction in dict.fromkeys((row["kernel"], row["direction"]) for row in rows):
         part = {r["variant"]: r for r in rows if r["kernel"] == kernel and r["direction"] == direction}
-        others = [f"{v} takes {part[v]['times_compiled']:.2g} x as long" for v in (REFERENCE, PLAIN) if v in part]
+        others = [f"{v} takes {part[v]['times_compiled']:.3g} x as long" for v in (REFERENCE, PLAIN) if v in part]
         own = part[COMPILED]
         findings.append(
             f"{kernel}, {direction}, {own['samples']:,} samples: {own['median_ms']:.3g} ms compiled, "
