@@ -194,9 +194,7 @@ def _result(probe: Probe, rates: Mapping[int, Rates], settings: Settings) -> Sui
     ]
     floor = sum(f.seconds for f in floors.values()) / WINDOW
     columns = {f"{n} thread{'s' * (n > 1)}": [1e3 * parts[n].get(part, 0.0) for part in names] for n in probe.threads}
-    columns["floor"] = [
-        1e3 * floors[part].seconds / WINDOW if part in floors else float("nan") for part in names
-    ]
+    columns["floor"] = [1e3 * floors[part].seconds / WINDOW if part in floors else float("nan") for part in names]
     plot = BarPlot(
         "profile_parts", "Where one training step's time goes", "milliseconds per step", names, columns
     )  # fmt: skip
