@@ -1,5 +1,6 @@
 """Flows: error of every solver against evaluations and time, and what every variant costs in a training step."""
 
+import math
 from typing import Any
 
 from dnerf.benchmarks.flow_rows import CLOSED_FLOWS, solver_rows, variant_rows
@@ -15,6 +16,8 @@ ROUNDED = 1e-14
 """Errors below this are float64's rounding."""
 SMALL = 0.5
 """Errors above this, in world units, say nothing of an order of convergence."""
+LOST = 2.0
+"""Errors above this, in world units, are as large as the scene: a solver that explodes, which would spoil a plot."""
 ENOUGH = 1e-3
 """Error in world units that no picture shows: a tenth of a step of the fast renderer."""
 
@@ -114,7 +117,7 @@ def _plot(rows: list[dict[str, Any]], field: str, axis: str) -> Plot:
                 solver if order is None else f"{solver} (order {order:.1f})",
                 [row[axis] for row in own],
                 # Rounding, which a logarithmic axis could not show as zero.
-                [max(row["max_error"], 1e-16) for row in own],
+                [max(row["max_error"], 1e-16) if row["max_error"] < LOST else math.nan for row in own],
                 x_low=low,
                 x_high=high,
                 style="line" if solver in FIXED_SOLVERS else "dashed",
@@ -126,7 +129,8 @@ def _plot(rows: list[dict[str, Any]], field: str, axis: str) -> Plot:
         x_label=AXES[axis],
         y_label="largest error (world units)",
         series=series,
-        note="Down and left is better. Solid: fixed steps; dashed: adaptive, from tolerance 1e-2 on the left.",
+        note="Down and left is better. Solid: fixed steps; dashed: adaptive, from tolerance 1e-2 on the left. "
+        f"Errors above {LOST:g} world units, the scene's own size, are left out.",
     )
 
 
