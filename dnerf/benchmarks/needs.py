@@ -13,6 +13,7 @@ from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 TOLERANCE = 0.1  # dB below the best that still counts as good enough
 QUICK = {"seconds": 1, "seeds": [0], "resolution": 40, "frames": 2}
 FULL = "everything"
+SMALLEST = "smallest"
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ def run(settings: Settings) -> SuiteResult:
     removed, smallest = smallest_enough(full, without, parts, trial, best.psnr - TOLERANCE)
     rows = [_row(FULL, full, full), *(_row(f"without {name}", t, full) for name, t in without.items())]
     if len(removed) > 1:
-        rows.append(_row(f"without {', '.join(removed)}", smallest, full))
+        rows.append(_row(f"{SMALLEST}: without {', '.join(removed)}", smallest, full))
     kept = last_of_each([*_base(options), *(o for name in removed for o in parts[name])])
     scene = scene_overrides(options["scene"], options["resolution"], options["data_root"])
     line = shlex.join(kept)
@@ -152,7 +153,8 @@ def _plot(rows: Sequence[Mapping[str, Any]], scene: str) -> Plot:
     for row in rows:
         half = 0.5 * (row["spread_dB"] or 0.0)
         ends = [row["psnr"] - half], [row["psnr"] + half]
-        series.append(Series(row["configuration"], [row["step_ms"]], [row["psnr"]], *ends, style="points"))
+        name = row["configuration"].partition(":")[0]
+        series.append(Series(name, [row["step_ms"]], [row["psnr"]], *ends, style="points"))
     return Plot(
         name="needs",
         title=f"What each part is worth on {scene}",

@@ -144,7 +144,7 @@ def _time_plot(rows: list[dict[str, Any]]) -> BarPlot:
         precision: [
             next(r["times_float32"] for r in rows if r["part"] == n and r["precision"] == precision) for n in names
         ]
-        for precision in PRECISIONS
+        for precision in PRECISIONS[1:]
     }
     return BarPlot(
         "precision_time", "Time of a forward and backward pass against float32", "times as long as float32",
