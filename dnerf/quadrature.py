@@ -127,8 +127,10 @@ def _parabolic(density: Tensor, samples: Samples) -> tuple[Tensor, Shares]:
     to_last = torch.where(touched, points - _before(points), 1.0)
     both = touches & touched
     # Second differences on unequal steps; at random points a step may be much shorter than the interval.
-    scale = torch.where(both, lengths.square() / (12 * (to_last + to_next)), 0.0)
-    last, following = scale / to_last, scale / to_next
+    # Quotients of lengths, since the square of one may overflow.
+    share = torch.where(both, lengths / (12 * (to_last + to_next)), 0.0)
+    shortest = 1e-6 * lengths
+    last, following = (share * (lengths / torch.maximum(step, shortest)) for step in (to_last, to_next))
     too_much = (last + following).clamp(min=1.0)
     last, following = last / too_much, following / too_much
     mass_before, mass_after = last * _before(density), following * _after(density)

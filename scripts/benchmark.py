@@ -1,7 +1,8 @@
-"""Run a benchmark suite and write its report: python scripts/benchmark.py suite=kernels [quick=true] [out_dir=...]"""
+"""Run a benchmark suite, or `all`, and write its report: python scripts/benchmark.py suite=kernels [quick=true]"""
 
 import shlex
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,38 +13,48 @@ from hydra import compose
 from hydra_app import build, resolve_device, run_app
 from omegaconf import DictConfig, OmegaConf
 
-from dnerf.benchmarks import Settings, describe_machine, run_suite, write_report
+from dnerf.benchmarks import Settings, describe_machine, run_suite, suite_names, write_report
 from dnerf.benchmarks.timing import num_threads
 from dnerf.checks import check_positive
 
+ALL = "all"
+
 
 def main(config: DictConfig) -> None:
-    """Run the suite named in the config, write its report, print its findings."""
-    folder = Path(config.out_dir or f"runs/benchmark/{config.suite}")
+    """Run the suite named in the config, or all of them, write reports, print findings."""
     threads = torch.get_num_threads() if config.threads is None else config.threads
     check_positive("threads", threads)
+    with num_threads(threads):
+        if config.suite != ALL:
+            _run(config, config.suite, Path(config.out_dir or f"runs/benchmark/{config.suite}"))
+            return
+        for name in suite_names():
+            _run(config, name, Path(config.out_dir or "runs/benchmark") / name)
+
+
+def _run(config: DictConfig, suite: str, folder: Path) -> None:
     torch.manual_seed(config.seed)
     section: Any = OmegaConf.to_container(config, resolve=True)
-    options = {"data_root": config.data_root, **section.get(config.suite, {})}
     device = resolve_device(config.device).type
     settings = Settings(
         quick=config.quick,
         seed=config.seed,
         device=device,
-        work_dir=Path("runs/benchmark") / f"{config.suite}_work",
+        work_dir=Path("runs/benchmark") / f"{suite}_work",
         train_command=(sys.executable, str(Path(__file__).with_name("train.py"))),
         build=_parts,
-        options=options,
+        options={"data_root": config.data_root, **section.get(suite, {})},
     )
-    with num_threads(threads):
-        machine = describe_machine(device)
-        result = run_suite(config.suite, settings)
-    command = shlex.join(["python", "scripts/benchmark.py", *sys.argv[1:]])
-    date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    machine = describe_machine()
+    begin = time.perf_counter()
+    result = run_suite(suite, settings)
+    others = [word for word in sys.argv[1:] if not word.startswith(("suite=", "out_dir="))]
+    command = shlex.join(["python", "scripts/benchmark.py", f"suite={suite}", *others, f"out_dir={folder}"])
+    date = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, in {time.perf_counter() - begin:.0f} s"
     path = write_report(result, folder, command=command, machine=machine, date=date)
     for finding in result.findings:
         print(f"- {finding}")
-    print(f"report: {path}")
+    print(f"report: {path}", flush=True)
 
 
 def _parts(overrides: Sequence[str]) -> Mapping[str, Any]:

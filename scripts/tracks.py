@@ -12,7 +12,7 @@ from hydra_app import build, load_config, load_renderer, resolve_device, run_app
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from dnerf.benchmarks.flow_rows import endpoint_rows
+from dnerf.benchmarks.endpoint_rows import endpoint_rows
 from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.data import SyntheticData

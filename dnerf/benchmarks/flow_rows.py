@@ -1,15 +1,14 @@
-"""What a flow costs and how right it is: solvers, variants, recovered motion. Each function returns rows of a table."""
+"""What a flow costs and how right it is: solvers and variants. Each function returns rows of a table."""
 
 import math
-import time
 from collections.abc import Callable, Sequence
-from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dnerf.benchmarks.closed_flows import CLOSED_FLOWS, ClosedFlow
+from dnerf.benchmarks.timing import Timing, time_in_turn
 from dnerf.checks import check_positive
 from dnerf.deformations import (
     Deformation,
@@ -21,26 +20,17 @@ from dnerf.deformations import (
 )
 from dnerf.deformations.solvers import ADAPTIVE_SOLVERS, FIXED_SOLVERS
 from dnerf.deformations.velocities import CurlVelocity, GridVelocity, NetworkVelocity, RigidVelocity, Velocity
-from dnerf.motion import MotionModel, carry
-from dnerf.scenes import AnalyticScene
 
 Row = dict[str, Any]
 
 BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
-STEPS = (1, 2, 4, 8, 16, 32)
+STEPS = (1, 2, 4, 8, 16, 32, 64)
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
 
-def milliseconds(function: Callable[[], object], repeats: int) -> float:
-    """Median wall-clock milliseconds of a call, after one that is not counted; waits for the GPU if there is one."""
-    durations = []
-    for _ in range(repeats + 1):
-        begin = time.perf_counter()
-        function()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        durations.append(1e3 * (time.perf_counter() - begin))
-    return median(durations[1:])
+def timed(function: Callable[[], object], repeats: int, device: str) -> Timing:
+    """Median and quartiles of a call's time, after one that is not counted."""
+    return time_in_turn({"call": function}, seconds=1e-9, min_repeats=repeats, device=device)["call"]
 
 
 def smooth_network() -> NetworkVelocity:
@@ -65,7 +55,7 @@ def solver_rows(
     """Error of every solver against its function evaluations and milliseconds, in float64.
 
     Points in [-1, 1]^3 at random times in [0, 1] are carried to time 0. The truth is the closed form, or for
-    "network" RK4 with 256 steps.
+    "network" RK4 with 512 steps.
 
     Args:
         fields: names of `CLOSED_FLOWS`, or "network" (a smooth network of 3 x 64).
@@ -76,8 +66,9 @@ def solver_rows(
         device: where to compute.
 
     Returns:
-        Rows of field, solver, setting, evaluations, milliseconds, max_error, mean_error and round_trip (largest
-        distance after the way there and the uncorrected way back, infinite if that fails), in world units.
+        Rows of field, solver, setting, evaluations, milliseconds (median_ms and the quartiles low_ms and high_ms),
+        max_error, mean_error and round_trip (largest distance after the way there and the uncorrected way back,
+        infinite if that fails), in world units.
     """
     check_positive("num_points", num_points)
     check_positive("repeats", repeats)
@@ -112,18 +103,18 @@ def solver_rows(
 def _truth(velocity: Velocity, positions: Tensor, times: Tensor) -> Tensor:
     if isinstance(velocity, ClosedFlow):
         return velocity.carry(positions, times, torch.zeros_like(times))
-    return FlowDeformation(velocity, num_steps=256)(positions, times)
+    return FlowDeformation(velocity, num_steps=512)(positions, times)
 
 
 @torch.no_grad()
 def _measure(flow: FlowDeformation, positions: Tensor, times: Tensor, truth: Tensor, repeats: int) -> Row:
-    duration = milliseconds(lambda: flow(positions, times), repeats)
+    timing = timed(lambda: flow(positions, times), repeats, positions.device.type)
     evaluations = flow.evaluations.last
     carried = flow(positions, times)
     errors = (carried - truth).norm(dim=-1)
     return {
         "evaluations": evaluations,
-        "milliseconds": duration,
+        **timing.milliseconds,
         "max_error": float(errors.max()),
         "mean_error": float(errors.mean()),
         "round_trip": _round_trip(flow, carried, times, positions),
@@ -195,7 +186,7 @@ def variant_rows(
 
     Returns:
         Rows of variant, evaluations, points (integrated: samples, or vertices of a lattice), forward_ms, training_ms
-        (forward and backward) and ratio (of training_ms to the first row's).
+        (forward and backward, median and quartiles) and ratio (of training_ms to the first row's).
     """
     made = variants()
     unknown = set(names) - set(made)
@@ -219,8 +210,8 @@ def variant_rows(
             forward().sum().backward()
 
         with torch.no_grad():
-            forward_ms = milliseconds(forward, repeats)
-        training_ms = milliseconds(step, repeats)
+            forward_time = timed(forward, repeats, device)
+        training = timed(step, repeats, device)
         flow = deformation.flow if isinstance(deformation, LatticeFlow | SkippingFlow) else deformation
         points = num_samples
         if isinstance(deformation, LatticeFlow):
@@ -232,94 +223,11 @@ def variant_rows(
                 "variant": name,
                 "evaluations": flow.evaluations.last if isinstance(flow, FlowDeformation) else 1,
                 "points": points,
-                "forward_ms": forward_ms,
-                "training_ms": training_ms,
-                "ratio": training_ms / (rows[0]["training_ms"] if rows else training_ms),
+                "forward_ms": 1e3 * forward_time.median,
+                "training_ms": 1e3 * training.median,
+                "training_low_ms": 1e3 * training.low,
+                "training_high_ms": 1e3 * training.high,
+                "ratio": 1e3 * training.median / (rows[0]["training_ms"] if rows else 1e3 * training.median),
             }
         )
     return rows
-
-
-@torch.no_grad()
-def endpoint_rows(
-    model: MotionModel,
-    scene: AnalyticScene,
-    *,
-    time: float = 0.0,
-    times: Sequence[float] = (0.1, 0.25, 0.5, 0.75, 1.0),
-    num_points: int = 4096,
-    depth: float = 0.05,
-    min_motion: float = 0.01,
-    seed: int = 0,
-) -> list[Row]:
-    """3-D end-point error of recovered motion: distance from where the scene's own matter really goes.
-
-    Points lie near the surface of exactly one body at both times (joints overlap, and there motion has no single
-    truth), at most `depth` below it: pictures show nothing further inside.
-
-    Args:
-        model: recovered motion, see `dnerf.motion`.
-        scene: the truth.
-        time: where points start, in [0, 1].
-        times: where they are followed to.
-        num_points: tried; those that qualify count.
-        depth: in world units.
-        min_motion: points that at none of `times` are so far from where they started are left out, in world units.
-        seed: of the points.
-
-    Returns:
-        Rows of time, num_points, moved (mean distance that matter moves, the error of a model in which nothing does),
-        mean_error, median_error and residual (median, see `carry`), in world units.
-
-    Raises:
-        ValueError: if nothing moves.
-    """
-    start = surface_points(scene, time, num_points, depth=depth, seed=seed)
-    farthest = torch.stack([(scene.advect(start, time, end) - start).norm(dim=-1) for end in times]).amax(0)
-    start = start[farthest > min_motion]
-    if not len(start):
-        raise ValueError(f"scene must have matter that moves by {min_motion} between time {time} and {list(times)}")
-    rows = []
-    for end in times:
-        truth = scene.advect(start, time, end)
-        moments = torch.full_like(truth[:, 0], end)
-        alone = scene.contains(truth, moments).sum(-1) == 1
-        points, target = start[alone], truth[alone]
-        moved, residual = carry(model, points, time, end)
-        errors = (moved - target).norm(dim=-1)
-        rows.append(
-            {
-                "time": end,
-                "num_points": len(points),
-                "moved": float((points - target).norm(dim=-1).mean()),
-                "mean_error": float(errors.mean()),
-                "median_error": float(errors.median()),
-                "residual": float(residual.median()),
-            }
-        )
-    return rows
-
-
-def surface_points(scene: AnalyticScene, time: float, num_points: int, *, depth: float, seed: int) -> Tensor:
-    """Points (N, 3) in exactly one body and at most about `depth` below its surface; N <= num_points.
-
-    Raises:
-        ValueError: if a scene has no such points.
-    """
-    check_positive("depth", depth)
-    generator = torch.Generator(scene.box.device).manual_seed(seed)
-    found: list[Tensor] = []
-    for _ in range(64):
-        unit = torch.rand(16384, 3, generator=generator, device=scene.box.device)
-        points = torch.lerp(scene.box[0], scene.box[1], unit)
-        shifts = torch.randn(len(points), 3, generator=generator, device=points.device)
-        outside = points + depth * torch.nn.functional.normalize(shifts, dim=-1)
-        times = torch.full_like(points[:, 0], time)
-        kept = (scene.contains(points, times).sum(-1) == 1) & (scene.body_indices(outside, times) < 0)
-        found.append(points[kept])
-        if sum(len(part) for part in found) >= num_points:
-            break
-    points = torch.cat(found)[:num_points]
-    if not len(points):
-        raise ValueError(f"scene must have matter within {depth} of its surface at time {time}, found none")
-    return points

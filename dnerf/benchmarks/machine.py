@@ -2,45 +2,30 @@
 
 import os
 import platform
-import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from dnerf.benchmarks.timing import time_in_turn
+from dnerf.provenance import commit, hardware
 
 PACKAGES = ("torch", "numpy", "numba", "triton", "torchdiffeq")
 
 
-def describe_machine(device: str = "cpu") -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     """Hardware, versions and commit, as a report records them. What cannot be found out is "unknown"."""
-    description = {
-        "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+    return {
+        "hardware": hardware(),
         "threads": torch.get_num_threads(),
         "memory_GiB": _memory_gib(),
         "system": platform.platform(terse=True),
         "python": platform.python_version(),
         **{name: _version(name) for name in PACKAGES},
-        "commit": _commit(),
+        "commit": commit(),
     }
-    if device == "cuda":
-        description["gpu"] = torch.cuda.get_device_name()
-    return description
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or "unknown"
 
 
 def _memory_gib() -> float | str:
@@ -55,19 +40,6 @@ def _version(name: str) -> str:
         return version(name)
     except PackageNotFoundError:
         return "not installed"
-
-
-def _commit() -> str:
-    """Hash of the checked-out commit, with "+ changes" if tracked files differ from it."""
-    folder = Path(__file__).parent
-    try:
-        done = [
-            subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True, timeout=10, check=True).stdout
-            for words in (["rev-parse", "--short=10", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
-        ]
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return done[0].strip() + (" + changes" if done[1].strip() else "")
 
 
 @dataclass(frozen=True)

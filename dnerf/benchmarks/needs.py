@@ -1,5 +1,6 @@
 """What a scene needs: short trainings with one part removed at a time, and the smallest model that is enough."""
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -12,14 +13,15 @@ from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 TOLERANCE = 0.1  # dB below the best that still counts as good enough
 QUICK = {"seconds": 1, "seeds": [0], "resolution": 40, "frames": 2}
 FULL = "everything"
+SMALLEST = "smallest"
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Mean scores of one configuration over the seeds."""
+    """Mean scores of one configuration over the seeds; with one seed, no spread."""
 
     psnr: float
-    spread: float
+    spread: float | None
     step_ms: float
     frame_s: float
     peak_mib: float
@@ -37,8 +39,11 @@ def run(settings: Settings) -> SuiteResult:
     removed, smallest = smallest_enough(full, without, parts, trial, best.psnr - TOLERANCE)
     rows = [_row(FULL, full, full), *(_row(f"without {name}", t, full) for name, t in without.items())]
     if len(removed) > 1:
-        rows.append(_row(f"without {', '.join(removed)}", smallest, full))
-    line = " ".join(_base(options) + [o for name in removed for o in parts[name]])
+        rows.append(_row(f"{SMALLEST}: without {', '.join(removed)}", smallest, full))
+    kept = last_of_each([*_base(options), *(o for name in removed for o in parts[name])])
+    scene = scene_overrides(options["scene"], options["resolution"], options["data_root"])
+    line = shlex.join(kept)
+    missed = ", ".join(name for name in parts if name not in removed) or "none"
     return SuiteResult(
         title=f"What {options['scene']} needs",
         summary=(
@@ -54,12 +59,24 @@ def run(settings: Settings) -> SuiteResult:
                 "Parts",
                 rows,
                 "buys_dB: what the removed part is worth; costs_ms and costs_MiB: what it takes per step and in peak "
-                "memory. Differences within the seeds' spread mean nothing.",
+                "memory. spread_dB: best less worst seed (none with one seed); smaller differences mean nothing.",
             )
         ],
         plots=[_plot(rows, str(options["scene"]))],
-        findings=[f"Within {TOLERANCE} dB of the best ({best.psnr:.2f} dB): `{line}` ({smallest.psnr:.2f} dB)."],
+        findings=[
+            f"The smallest configuration within {TOLERANCE} dB of the best ({best.psnr:.2f} dB) reaches "
+            f"{smallest.psnr:.2f} dB with {smallest.num_parameters:,} parameters, {smallest.step_ms:.3g} ms a step and "
+            f"{smallest.peak_mib:.0f} MiB: `{line}`",
+            f"To train it: `python scripts/train.py {shlex.join([*kept, *scene])}`",
+            f"{options['scene']} does not miss: {', '.join(removed) or 'nothing'}. It needs: {missed}.",
+        ],
     )
+
+
+def last_of_each(overrides: Sequence[str]) -> list[str]:
+    """Overrides without those whose key comes again later, which would be replaced anyhow."""
+    last = {override.partition("=")[0]: override for override in overrides}
+    return [override for override in overrides if last[override.partition("=")[0]] == override]
 
 
 def smallest_enough(
@@ -105,7 +122,7 @@ def _trainer(settings: Settings, options: Mapping[str, Any]) -> Callable[[str, S
             runs.append(run_training(settings.train_command, [*common, *overrides, f"seed={seed}"], folder))
         return Trial(
             psnr=fmean(r.psnr for r in runs),
-            spread=max(r.psnr for r in runs) - min(r.psnr for r in runs),
+            spread=max(r.psnr for r in runs) - min(r.psnr for r in runs) if len(runs) > 1 else None,
             step_ms=fmean(r.step_ms for r in runs),
             frame_s=fmean(r.seconds_per_frame for r in runs),
             peak_mib=max(r.peak_mib for r in runs),
@@ -132,7 +149,12 @@ def _row(name: str, trial: Trial, full: Trial) -> dict[str, Any]:
 
 
 def _plot(rows: Sequence[Mapping[str, Any]], scene: str) -> Plot:
-    series = [Series(r["configuration"], [r["step_ms"]], [r["psnr"]], style="points") for r in rows]
+    series = []
+    for row in rows:
+        half = 0.5 * (row["spread_dB"] or 0.0)
+        ends = [row["psnr"] - half], [row["psnr"] + half]
+        name = row["configuration"].partition(":")[0]
+        series.append(Series(name, [row["step_ms"]], [row["psnr"]], *ends, style="points"))
     return Plot(
         name="needs",
         title=f"What each part is worth on {scene}",

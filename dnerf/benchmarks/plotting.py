@@ -1,6 +1,7 @@
 """Plots that read without the text: units on the axes, every line labelled where it ends."""
 
 import math
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from dnerf.files import atomic_path
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5195", "#4D4D4D", "#8C6D31", "#B22222")
 """Okabe and Ito's colours, which the colour-blind tell apart, and four more."""
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-STYLES = ("line", "points", "guide")
+STYLES = ("line", "dashed", "points", "guide")
 
 
 def draw(plot: Plot | BarPlot, path: Path) -> None:
@@ -21,7 +22,10 @@ def draw(plot: Plot | BarPlot, path: Path) -> None:
         ValueError: without matplotlib, without a series, or for an unknown style.
     """
     pyplot = _pyplot()
-    figure, axes = pyplot.subplots(figsize=(8.4, 5.0), dpi=120, layout="constrained")
+    height = 5.0
+    if isinstance(plot, BarPlot):
+        height = max(height, 1.2 + 0.24 * len(plot.categories) * max(len(plot.values), 2))
+    figure, axes = pyplot.subplots(figsize=(8.4, height), dpi=120, layout="constrained")
     try:
         axes.set_title(plot.title, loc="left", fontsize=12, fontweight="bold")
         axes.set_xlabel(plot.x_label)
@@ -57,9 +61,9 @@ def _draw_bars(figure: Any, axes: Any, plot: BarPlot) -> None:
     for index, (label, lengths) in enumerate(plot.values.items()):
         places = [k - 0.4 + (index + 0.5) * height for k in range(len(plot.categories))]
         bars = axes.barh(places, lengths, 0.92 * height, color=COLORS[index % len(COLORS)], label=label)
-        texts = [f" {length:.3g}" if math.isfinite(length) else "" for length in lengths]
+        texts = [f" {length:.2g}" if math.isfinite(length) else "" for length in lengths]
         axes.bar_label(bars, texts, fontsize=8)
-    axes.set_yticks(range(len(plot.categories)), plot.categories)
+    axes.set_yticks(range(len(plot.categories)), [textwrap.fill(text, 36) for text in plot.categories])
     axes.invert_yaxis()
     if plot.log:
         axes.set_xscale("log")
@@ -85,19 +89,23 @@ def _draw_series(axes: Any, series: Series, index: int) -> tuple[float, float, s
     if not points:
         return None
     xs, ys, kept = zip(*points)
+    index = index if series.color is None else series.color
     color = "#999999" if series.style == "guide" else COLORS[index % len(COLORS)]
     if series.style == "guide":
         axes.plot(xs, ys, color=color, linestyle="--", linewidth=1.0, zorder=1)
     else:
-        line = "-" if series.style == "line" else "none"
+        line = {"line": "-", "dashed": (0, (4, 2)), "points": "none"}[series.style]
         marker = MARKERS[index % len(MARKERS)]
         axes.plot(xs, ys, color=color, linestyle=line, linewidth=1.8, marker=marker, markersize=5.5, zorder=3)
     if series.low is not None and series.high is not None:
         low, high = ([values[k] for k in kept] for values in (series.low, series.high))
-        if series.style == "line" and len(xs) > 1:
+        if series.style in ("line", "dashed") and len(xs) > 1:
             axes.fill_between(xs, low, high, color=color, alpha=0.15, linewidth=0, zorder=2)
         else:
             axes.vlines(xs, low, high, color=color, alpha=0.6, linewidth=1.5, zorder=2)
+    if series.x_low is not None and series.x_high is not None:
+        low, high = ([values[k] for k in kept] for values in (series.x_low, series.x_high))
+        axes.hlines(ys, low, high, color=color, alpha=0.35, linewidth=3.5, zorder=2)
     for x, y, k in zip(xs, ys, kept):
         if series.notes is not None and series.notes[k]:
             axes.annotate(

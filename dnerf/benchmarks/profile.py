@@ -56,7 +56,7 @@ def run(settings: Settings) -> SuiteResult:
         rates[count] = measure_rates(settings.device, seconds=0.15 if settings.quick else 1.0)
     torch.set_num_threads(cores)
     num_steps = warm + WINDOW * (len(threads) * (timed + NUM_PROFILED) + 1)
-    overrides = scene_overrides(options["scene"], 80 if settings.quick else 400, options["data_root"], settings.quick)
+    overrides = scene_overrides(options["scene"], 80 if settings.quick else 100, options["data_root"], settings.quick)
     parts = settings.parts(
         *options["overrides"], *overrides, f"trainer.num_steps={num_steps}", "trainer.max_seconds=null",
         f"trainer.log_every={WINDOW}", "trainer.progress_bar=false",
@@ -194,9 +194,7 @@ def _result(probe: Probe, rates: Mapping[int, Rates], settings: Settings) -> Sui
     ]
     floor = sum(f.seconds for f in floors.values()) / WINDOW
     columns = {f"{n} thread{'s' * (n > 1)}": [1e3 * parts[n].get(part, 0.0) for part in names] for n in probe.threads}
-    columns["floor, all cores"] = [
-        1e3 * floors[part].seconds / WINDOW if part in floors else float("nan") for part in names
-    ]
+    columns["floor"] = [1e3 * floors[part].seconds / WINDOW if part in floors else float("nan") for part in names]
     plot = BarPlot(
         "profile_parts", "Where one training step's time goes", "milliseconds per step", names, columns
     )  # fmt: skip

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dnerf.benchmarks.machine import describe_machine
 from dnerf.files import write_json
+from dnerf.provenance import commit
 
 KEPT = "benchmark_run.json"
 
@@ -67,7 +67,7 @@ def run_training(command: Sequence[str], overrides: Sequence[str], folder: Path)
         ValueError: if the child fails, with its last line.
     """
     folder = Path(folder)
-    key = {"overrides": list(overrides), "commit": describe_machine()["commit"]}
+    key = {"overrides": list(overrides), "commit": commit()}
     kept = _kept(folder, key)
     if kept is not None:
         return kept
@@ -108,5 +108,5 @@ def _kept(folder: Path, key: dict[str, Any]) -> Run | None:
     except (OSError, ValueError):
         return None
     same = all(saved.get(name) == value for name, value in key.items())
-    clean = key["commit"] != "unknown" and "changes" not in key["commit"]
+    clean = key["commit"] != "unknown" and not key["commit"].endswith("-dirty")
     return Run(**saved["run"]) if same and clean else None

@@ -41,8 +41,11 @@ class Series:
         y: values along the vertical axis.
         low: lower ends of the spread of y, or None.
         high: upper ends.
+        x_low: lower ends of the spread of x, or None.
+        x_high: upper ends.
         notes: text beside single points, or None.
-        style: "line", "points" or "guide" (thin, dashed, grey: a theoretical order, a limit).
+        style: "line", "dashed", "points" or "guide" (thin, dashed, grey: a theoretical order, a limit).
+        color: index of the palette, for series that belong together; None gives every series its own.
     """
 
     label: str
@@ -50,8 +53,11 @@ class Series:
     y: Sequence[float]
     low: Sequence[float] | None = None
     high: Sequence[float] | None = None
+    x_low: Sequence[float] | None = None
+    x_high: Sequence[float] | None = None
     notes: Sequence[str] | None = None
     style: str = "line"
+    color: int | None = None
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,11 @@
 """The flow's benchmarks: rows say what they should, and errors are those of the truth."""
 
-import math
-
 import pytest
 import torch
-from torch import Tensor
 
 from dnerf.benchmarks.closed_flows import CLOSED_FLOWS
-from dnerf.benchmarks.flow_rows import endpoint_rows, smooth_network, solver_rows, surface_points, variant_rows
-from dnerf.deformations import IdentityDeformation
+from dnerf.benchmarks.flow_rows import smooth_network, solver_rows, variant_rows
 from dnerf.deformations.solvers import SOLVERS
-from dnerf.scenes import make_scene
 
 
 @pytest.mark.parametrize("name", CLOSED_FLOWS)
@@ -32,7 +27,7 @@ def test_solver_rows_show_the_error_falling_with_the_evaluations() -> None:
             coarse, fine = (row for row in rows if row["field"] == field and row["solver"] == solver)
             assert fine["evaluations"] == 2 * coarse["evaluations"] == 8 * order
             assert fine["max_error"] < coarse["max_error"] / 2 ** (order - 0.5)
-            assert fine["milliseconds"] > 0
+            assert fine["low_ms"] > 0
 
 
 def test_the_network_is_always_the_same_and_moves_points_by_about_half_a_unit() -> None:
@@ -50,37 +45,3 @@ def test_variant_rows_compare_with_the_first() -> None:
     assert rows[0]["ratio"] == 1
     with pytest.raises(ValueError, match=r"names must be some of displacement .*; got magic"):
         variant_rows(("magic",))
-
-
-def test_the_scene_itself_has_no_end_point_error() -> None:
-    scene = make_scene("walker")
-    for row in endpoint_rows(scene, scene, num_points=200, times=(0.2, 0.5)):
-        assert row["mean_error"] == 0
-        assert row["moved"] > 0.01
-
-
-def test_a_model_that_stands_still_is_wrong_by_the_motion() -> None:
-    scene = make_scene("orbiting_balls")
-    rows = endpoint_rows(IdentityDeformation(), scene, num_points=300, times=(0.25,))
-    assert math.isclose(rows[0]["mean_error"], rows[0]["moved"], rel_tol=1e-5)
-    assert rows[0]["moved"] > 0.3
-
-
-def test_points_are_in_one_body_near_its_surface() -> None:
-    scene = make_scene("walker")
-    points = surface_points(scene, 0.3, 300, depth=0.02, seed=0)
-    times = torch.full((len(points),), 0.3)
-    assert torch.all(scene.contains(points, times).sum(-1) == 1)
-
-    def free(directions: Tensor) -> Tensor:
-        return scene.body_indices(points + 0.02 * directions, times) < 0
-
-    tried = torch.stack([free(torch.nn.functional.normalize(torch.randn(len(points), 3), dim=-1)) for _ in range(60)])
-    # A point just below a flat surface sees it in a few directions only.
-    assert tried.any(0).float().mean() > 0.8
-
-
-def test_a_scene_without_motion_is_named() -> None:
-    scene = make_scene("static")
-    with pytest.raises(ValueError, match=r"matter that moves by 0\.01"):
-        endpoint_rows(scene, scene, num_points=50)

@@ -65,6 +65,7 @@ def test_plot_skips_what_is_not_finite_and_refuses_nonsense(tmp_path):
         Series("some", [1, 2, 4], [1.0, float("nan"), 0.25], notes=["a", "", "c"], style="points"),
         Series("guide", [1, 4], [1.0, 0.0625], style="guide"),
         Series("none", [1.0], [float("inf")]),
+        Series("dashed", [1, 4], [1.0, 2.0], x_low=[0.5, 3], x_high=[2, 5], style="dashed", color=0),
     ]
     write(tmp_path, result(plots=[Plot("p", "P", "x", "y", series)]))
     assert (tmp_path / "p.png").is_file()

@@ -2,11 +2,14 @@
 
 import json
 import sys
+from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from dnerf.benchmarks import runs
-from dnerf.benchmarks.needs import Trial, smallest_enough
+from dnerf.benchmarks.needs import Trial, last_of_each, smallest_enough
 from dnerf.benchmarks.runs import run_training
 from dnerf.benchmarks.scenes import scene_overrides
 from dnerf.benchmarks.suite import Settings
@@ -48,8 +51,8 @@ def test_memory_is_that_of_this_child_alone(command, tmp_path):
 
 
 def test_a_run_of_the_same_clean_commit_is_not_repeated(command, tmp_path, monkeypatch):
-    for commit, expected in (("abc", 1), ("abc", 1), ("def", 2), ("def + changes", 3), ("def + changes", 4)):
-        monkeypatch.setattr(runs, "describe_machine", lambda commit=commit: {"commit": commit})
+    for commit, expected in (("abc", 1), ("abc", 1), ("def", 2), ("def-dirty", 3), ("def-dirty", 4)):
+        monkeypatch.setattr(runs, "commit", lambda commit=commit: commit)
         assert run_training(command, ["seed=2"], tmp_path / "run").psnr == 23
         assert len((tmp_path / "calls.txt").read_text().splitlines()) == expected
 
@@ -103,6 +106,20 @@ def test_all_parts_stay_if_each_is_missed():
     without = {"a": trial(20.0)}
     full = trial(30.0)
     assert smallest_enough(full, without, {"a": []}, lambda name, overrides: full, 29.9) == ([], full)
+
+
+def test_an_override_that_is_replaced_is_not_printed():
+    assert last_of_each(["a=1", "b=2", "a=null"]) == ["b=2", "a=null"]
+
+
+def test_every_part_of_the_needs_can_be_removed_by_its_overrides():
+    conf = Path(__file__).parents[2] / "conf"
+    section = OmegaConf.load(conf / "benchmark.yaml").needs
+    base = [f"experiment={section.experiment}", *section.full]
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        full = compose("train", base)
+        for name, overrides in section.parts.items():
+            assert compose("train", last_of_each([*base, *overrides])) != full, name
 
 
 def test_scenes_are_exact_ones_or_folders(tmp_path):
