@@ -27,7 +27,8 @@ def draw(plot: Plot | BarPlot, path: Path) -> None:
         height = max(height, 1.2 + 0.24 * len(plot.categories) * max(len(plot.values), 2))
     figure, axes = pyplot.subplots(figsize=(8.4, height), dpi=120, layout="constrained")
     try:
-        axes.set_title(plot.title, loc="left", fontsize=12, fontweight="bold")
+        # Of the figure rather than of the axes, which long labels may leave little width.
+        figure.suptitle(plot.title, x=0.01, horizontalalignment="left", fontsize=12, fontweight="bold")
         axes.set_xlabel(plot.x_label)
         axes.spines[["top", "right"]].set_visible(False)
         if isinstance(plot, BarPlot):
@@ -61,14 +62,19 @@ def _draw_bars(figure: Any, axes: Any, plot: BarPlot) -> None:
     for index, (label, lengths) in enumerate(plot.values.items()):
         places = [k - 0.4 + (index + 0.5) * height for k in range(len(plot.categories))]
         bars = axes.barh(places, lengths, 0.92 * height, color=COLORS[index % len(COLORS)], label=label)
-        texts = [f" {length:.2g}" if math.isfinite(length) else "" for length in lengths]
+        texts = [f" {_short(length)}" if math.isfinite(length) else "" for length in lengths]
         axes.bar_label(bars, texts, fontsize=8)
-    axes.set_yticks(range(len(plot.categories)), [textwrap.fill(text, 36) for text in plot.categories])
+    axes.set_yticks(range(len(plot.categories)), [textwrap.fill(text, 42) for text in plot.categories])
     axes.invert_yaxis()
     if plot.log:
         axes.set_xscale("log")
     axes.margins(x=0.12)
     figure.legend(frameon=False, loc="outside lower center", ncols=count, fontsize=10)
+
+
+def _short(value: float) -> str:
+    """A number beside a bar: two digits, no powers of ten for those of everyday size."""
+    return f"{value:,.0f}" if 100 <= abs(value) < 1e6 else f"{value:.2g}"
 
 
 def _pyplot() -> Any:
