@@ -1,8 +1,9 @@
-"""What pruning costs and saves: occupancy threshold, grid resolution, time slabs, transmittance cut-off."""
+"""What pruning costs and saves: occupancy, transmittance cut-off, step, and the lattice of the deformation."""
 
+import copy
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,6 +12,8 @@ from dnerf.benchmarks.scenes import scene_overrides
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import time_in_turn
 from dnerf.data.frames import Frames
+from dnerf.deformations import FrameLattice
+from dnerf.fields import DeformedField
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
 
@@ -21,9 +24,21 @@ KNOBS = {
     "threshold": "occupancy threshold (1 / world unit)",
     "resolution": "occupancy cells along the longest side",
     "slabs": "occupancy slabs of time",
+    "margin": "cells by which what training found is widened in space",
     "cut-off": "transmittance at which a ray ends",
     "step": "step along a ray (world units)",
+    "lattice": "cells of the lattice that the deformation is kept on",
 }
+
+
+class Setting(NamedTuple):
+    """One setting of one knob; all other knobs leave out nothing that can be helped."""
+
+    knob: str
+    value: float | None
+    sampler: OccupancySampler
+    cut: float = 0.0
+    lattice: FrameLattice | None = None
 
 
 def run(settings: Settings) -> SuiteResult:
@@ -41,12 +56,10 @@ def run(settings: Settings) -> SuiteResult:
     if not isinstance(trained, OccupancySampler):
         raise ValueError(f"pruning.experiment must sample by occupancy, got {type(trained).__name__}")
     chosen = [0, len(frames) // 2]
-    everything = _grid(trained, resolution=8, num_slabs=1)
-    everything.occupy(torch.tensor(True))
-    reference = _pictures(renderer, everything, frames, chosen)
+    reference = _pictures(renderer, Setting("", None, _everything(trained)), frames, chosen)
     rows = [
-        _measure(renderer, sampler, frames, chosen, reference, settings, knob, value, cut)
-        for knob, value, sampler, cut in _settings(renderer, trained, options, settings)
+        _measure(renderer, setting, frames, chosen, reference, settings)
+        for setting in _settings(renderer, trained, options, settings)
     ]
     full = next(row for row in rows if row["knob"] == "nothing left out")
     for row in rows:
@@ -57,7 +70,8 @@ def run(settings: Settings) -> SuiteResult:
             f"`experiment={options['experiment']}` trained on `{options['scene']}`; two test frames of {resolution} x "
             f"{resolution} pixels rendered in evaluation mode with every setting of one knob at a time. Occupancy "
             "grids are filled from the finished field (`OccupancySampler.fill`, random probes of every cell), so that "
-            "their error is what a setting loses; `as trained` is the grid that training left behind. The "
+            "their error is what a setting loses; `as trained` is the grid that training left behind, without its "
+            "margin in space if the experiment renders so; `the experiment's own` adds its cut-off and lattice. The "
             f"reference samples the whole box at the trained step, {trained.step_size:g}, and leaves out nothing: "
             "errors are of pruning alone, not of the model. The experiment's own settings: threshold "
             f"{trained.threshold:g}, {int(trained.shape[1:].max())} cells, {int(trained.shape[0])} slabs, cut-off "
@@ -86,10 +100,15 @@ def _grid(
     return grid.to(trained.box.device).eval()
 
 
+def _everything(trained: OccupancySampler) -> OccupancySampler:
+    everything = _grid(trained, resolution=8, num_slabs=1)
+    everything.occupy(torch.tensor(True))
+    return everything
+
+
 def _settings(
     renderer: Renderer, trained: OccupancySampler, options: Mapping[str, Any], settings: Settings
-) -> Iterator[tuple[str, float | None, OccupancySampler, float]]:
-    """Knob, its value, the sampler and the cut-off of every setting."""
+) -> Iterator[Setting]:
     slabs, cells = int(trained.shape[0]), int(trained.shape[1:].max())
     if settings.quick:
         slabs, cells = 4, 16
@@ -101,46 +120,56 @@ def _settings(
             grid.fill(renderer.field, 1 if settings.quick else PROBES)
         return grid
 
-    everything = _grid(trained, resolution=8, num_slabs=1)
-    everything.occupy(torch.tensor(True))
-    yield "nothing left out", None, everything, 0.0
-    yield "as trained", None, trained, 0.0
+    yield Setting("nothing left out", None, _everything(trained))
+    yield Setting("as trained", None, trained)
+    own = renderer.field.frame_lattice if isinstance(renderer.field, DeformedField) else None
+    yield Setting("the experiment's own", None, trained, renderer.stop_transmittance, own)
     for value in options["thresholds"][few]:
-        yield "threshold", value, filled(threshold=value), 0.0
+        yield Setting("threshold", value, filled(threshold=value))
     for value in options["resolutions"][few]:
-        yield "resolution", value, filled(resolution=value), 0.0
+        yield Setting("resolution", value, filled(resolution=value))
     for value in options["slabs"][few]:
-        yield "slabs", value, filled(num_slabs=value), 0.0
+        yield Setting("slabs", value, filled(num_slabs=value))
+    if trained.rendered is not None:
+        wide = copy.deepcopy(trained)
+        wide.occupy(trained.occupied)
+        yield Setting("margin", 1, wide)
+        yield Setting("margin", 0, trained)
     for value in options["steps"][few]:
-        yield "step", value, filled(step=value), 0.0
+        yield Setting("step", value, filled(step=value))
     for value in options["cuts"][few]:
-        yield "cut-off", value, trained, value
+        yield Setting("cut-off", value, trained, value)
+    for value in options["lattices"][few]:
+        yield Setting("lattice", value, trained, 0.0, FrameLattice(trained.box.tolist(), value))
 
 
 @contextmanager
-def _using(renderer: Renderer, sampler: OccupancySampler, cut: float) -> Iterator[None]:
-    """Render with another sampler and cut-off within a `with` block."""
+def _using(renderer: Renderer, setting: Setting) -> Iterator[None]:
+    """Render with a setting within a `with` block."""
+    field = renderer.field
     before = renderer.sampler, renderer.stop_transmittance
-    renderer.sampler, renderer.stop_transmittance = sampler, cut
+    lattice = field.frame_lattice if isinstance(field, DeformedField) else None
+    renderer.sampler, renderer.stop_transmittance = setting.sampler, setting.cut
     try:
+        if isinstance(field, DeformedField):
+            field.frame_lattice = setting.lattice
         yield
     finally:
         renderer.sampler, renderer.stop_transmittance = before
+        if isinstance(field, DeformedField):
+            field.frame_lattice = lattice
 
 
-def _pictures(
-    renderer: Renderer, sampler: OccupancySampler, frames: Frames, chosen: list[int], cut: float = 0.0
-) -> Tensor:
-    with _using(renderer, sampler, cut):
+def _pictures(renderer: Renderer, setting: Setting, frames: Frames, chosen: list[int]) -> Tensor:
+    with _using(renderer, setting):
         return torch.stack([renderer.render_image(frames.camera(i), float(frames.times[i])).rgb for i in chosen])
 
 
 def _measure(
-    renderer: Renderer, sampler: OccupancySampler, frames: Frames, chosen: list[int], reference: Tensor,
-    settings: Settings, knob: str, value: float | None, cut: float,
-) -> dict[str, Any]:  # fmt: skip
+    renderer: Renderer, setting: Setting, frames: Frames, chosen: list[int], reference: Tensor, settings: Settings
+) -> dict[str, Any]:
     def call() -> Tensor:
-        return _pictures(renderer, sampler, frames, chosen, cut)
+        return _pictures(renderer, setting, frames, chosen)
 
     difference = (call() - reference).abs()
     error = float(difference.square().mean())
@@ -148,11 +177,13 @@ def _measure(
         {"call": call}, seconds=0.1 if settings.quick else 1.0, min_repeats=2 if settings.quick else 3,
         device=settings.device,
     )["call"]  # fmt: skip
+    sampler = setting.sampler
     samples = sum(_num_samples(renderer, sampler, frames, i) for i in chosen)
+    occupied = sampler.occupied if sampler.rendered is None else sampler.rendered
     return {
-        "knob": knob,
-        "value": value,
-        "occupied": float(sampler.occupied.float().mean()),
+        "knob": setting.knob,
+        "value": setting.value,
+        "occupied": float(occupied.float().mean()),
         "samples_per_ray": samples / (len(chosen) * frames.intrinsics.width * frames.intrinsics.height),
         "rms_error": error**0.5,
         "worst_pixel": float(difference.max()),
@@ -171,7 +202,7 @@ def _num_samples(renderer: Renderer, sampler: OccupancySampler, frames: Frames, 
 def _plot(rows: list[dict[str, Any]], knob: str) -> Plot:
     """One knob's settings beside what is left out by none and by the grid as training left it."""
     series = []
-    for name in ("nothing left out", "as trained", knob):
+    for name in ("nothing left out", "as trained", "the experiment's own", knob):
         part = [row for row in rows if row["knob"] == name]
         x, y = [row["median_ms"] for row in part], [max(row["rms_error"], FLOOR) for row in part]
         notes = ["" if row["value"] is None else f"{row['value']:g}" for row in part]
