@@ -137,9 +137,9 @@ def check_continuity(
     if worst[0] < 1e-4 * LEVEL:
         return Finding("time continuity", math.inf, least_order, True, "order in h; nothing changes")
     # A picture that no longer changes at all is below rounding: nothing jumps.
-    finest = [math.log2(max(change, 1e-30)) for change in worst[-SLOPE_OVER - 1 :]]
+    logarithms = [math.log2(max(change, 1e-30)) for change in worst[-SLOPE_OVER - 1 :]]
     centered = [i - SLOPE_OVER / 2 for i in range(SLOPE_OVER + 1)]
-    order = -sum(c * y for c, y in zip(centered, finest)) / sum(c * c for c in centered)
+    order = -sum(c * y for c, y in zip(centered, logarithms)) / sum(c * c for c in centered)
     return Finding("time continuity", order, least_order, order >= least_order, "order in h of the change")
 
 

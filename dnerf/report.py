@@ -187,7 +187,9 @@ def _protocol_note(metrics: Mapping[str, Any]) -> str:
 
 
 def _number_of_frames(metrics: Mapping[str, Any]) -> str:
-    scored, there = metrics["num_frames"], metrics.get("frames_of_split", metrics["num_frames"])
+    scored, there = metrics["num_frames"], metrics.get("frames_of_split")
+    if there is None:
+        return f"{scored} frames"
     return f"{scored} of the {there} frames" if scored < there else f"all {there} frames"
 
 
