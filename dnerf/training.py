@@ -21,6 +21,7 @@ from dnerf.recovery import SHOWN, Recovery, what_is_shown
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder, RunState, fingerprint, max_bytes
 from dnerf.stopping import StopRequest, TrainingStopped, stop_requests
+from dnerf.time_window import TimeWindow
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ class Trainer:
         betas: Adam's moment decay rates.
         epsilon: Adam's epsilon.
         losses: terms by name; the photometric loss if None.
+        time_window: lets frames in by time as training goes on; None for all from the start.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
@@ -76,6 +78,7 @@ class Trainer:
         betas: Sequence[float] = (0.9, 0.999),
         epsilon: float = 1e-8,
         losses: Mapping[str, Loss] | None = None,
+        time_window: TimeWindow | None = None,
         log_every: int = 20,
         checkpoint_every: int | None = 1000,
         progress_bar: bool = True,
@@ -107,6 +110,7 @@ class Trainer:
         self.betas = (betas[0], betas[1])
         self.epsilon = epsilon
         self.losses = nn.ModuleDict({"rgb": PhotometricLoss()} if losses is None else dict(losses))
+        self.time_window = time_window
         self.log_every = log_every
         self.checkpoint_every = checkpoint_every
         self.progress_bar = progress_bar
@@ -248,7 +252,10 @@ class Trainer:
         processes.merge_observations(renderer, run.step)
         renderer.update(run.step)
         generator, num_rays, share = run.generator, run.num_rays, processes.share(run.num_rays)
-        indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)
+        if self.time_window is None:
+            indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)
+        else:
+            indices = self.time_window.draw(frames.times, frames.num_pixels, num_rays, progress, generator=generator)
         rays, rgba = frames.pixels(indices[share])
         with processes.same_randomness(generator, num_rays):
             rendering = model(rays, generator=generator)

@@ -63,6 +63,11 @@ def test_motion_losses_join_the_flow(loss):
     assert set(terms[-1]) == {"loss", "rgb", loss}
 
 
+def test_a_time_window_joins_any_experiment():
+    trainer = instantiate(composed("experiment=fast", "+trainer/time_window=growing").trainer, _convert_="all")
+    assert trainer.time_window.num_frames(100, 0.0) == 5
+
+
 def test_every_scene_has_a_config_that_builds_it():
     for name in names("scene"):
         assert isinstance(instantiate(composed(f"scene={name}").data, _convert_="all"), SyntheticData)
