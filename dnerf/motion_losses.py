@@ -90,7 +90,7 @@ class SmoothVelocityLoss(MotionLoss):
         distance: of the forward differences, in world units.
     """
 
-    def __init__(self, weight: float = 1e-4, num_points: int = 1024, *, distance: float = 0.02) -> None:
+    def __init__(self, weight: float = 1e-3, num_points: int = 1024, *, distance: float = 0.02) -> None:
         super().__init__(weight, num_points)
         check_positive("distance", distance)
         self.distance = distance

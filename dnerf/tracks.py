@@ -93,6 +93,7 @@ def render_tracks(
     times: Sequence[float],
     *,
     trail: int = 12,
+    every: int = 1,
     tolerance: float = 0.08,
     chunk: int = 16384,
 ) -> tuple[Trajectories, Iterator[Tensor]]:
@@ -103,14 +104,16 @@ def render_tracks(
         camera: the view, on the model's device.
         points: (P, 3) in world units, at `time`.
         time: in [0, 1].
-        times: of the sequence's pictures, each in [0, 1].
-        trail: earlier pictures of the sequence that a trail reaches back.
+        times: of the sequence, each in [0, 1].
+        trail: earlier times of the sequence that a trail reaches back.
+        every: one picture is drawn of so many times, the last one among them.
         tolerance: distance behind the picture's surface at which a point counts as hidden, in world units.
         chunk: rays at a time.
 
     Returns:
         The tracks, and an iterator over pictures (H, W, 3) uint8, rendered as they are asked for.
     """
+    check_positive("every", every)
     moments = torch.tensor(list(times), dtype=points.dtype, device=points.device)
     tracks = follow(motion_model(renderer), points, time, moments)
     pixels, depths = camera.project(tracks.positions)
@@ -118,8 +121,8 @@ def render_tracks(
 
     def pictures() -> Iterator[Tensor]:
         size = torch.tensor([camera.intrinsics.width, camera.intrinsics.height], device=points.device)
-        for i, moment in enumerate(times):
-            rendering = renderer.render_image(camera, float(moment), chunk=chunk)
+        for i in range((len(times) - 1) % every, len(times), every):
+            rendering = renderer.render_image(camera, float(times[i]), chunk=chunk)
             nearest = torch.where(depths[i, :, None] > 0, pixels[i], -1.0).round().long()
             inside = ((nearest >= 0) & (nearest < size)).all(-1)
             columns, rows = torch.where(inside[:, None], nearest, 0).unbind(-1)

@@ -22,6 +22,7 @@ from dnerf.recovery import SHOWN, Recovery, what_is_shown
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder, RunState, fingerprint, max_bytes
 from dnerf.stopping import StopRequest, TrainingStopped, stop_requests
+from dnerf.time_window import TimeWindow
 
 logger = logging.getLogger(__name__)
 
@@ -55,6 +56,7 @@ class Trainer:
         orthogonal: parameter-name prefixes of the renderer below which the weight matrices of networks (those of 16
             rows and columns or more) take orthogonalised steps, see `AdamMuon`.
         losses: terms by name; the photometric loss if None.
+        time_window: lets frames in by time as training goes on; None for all from the start.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
@@ -80,6 +82,7 @@ class Trainer:
         epsilon: float = 1e-8,
         orthogonal: Sequence[str] = (),
         losses: Mapping[str, Loss] | None = None,
+        time_window: TimeWindow | None = None,
         log_every: int = 20,
         checkpoint_every: int | None = 1000,
         progress_bar: bool = True,
@@ -112,6 +115,7 @@ class Trainer:
         self.epsilon = epsilon
         self.orthogonal = tuple(orthogonal)
         self.losses = nn.ModuleDict({"rgb": PhotometricLoss()} if losses is None else dict(losses))
+        self.time_window = time_window
         self.log_every = log_every
         self.checkpoint_every = checkpoint_every
         self.progress_bar = progress_bar
@@ -253,7 +257,10 @@ class Trainer:
         processes.merge_observations(renderer, run.step)
         renderer.update(run.step)
         generator, num_rays, share = run.generator, run.num_rays, processes.share(run.num_rays)
-        indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)
+        if self.time_window is None:
+            indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)
+        else:
+            indices = self.time_window.draw(frames.times, frames.num_pixels, num_rays, progress, generator=generator)
         rays, rgba = frames.pixels(indices[share])
         with processes.same_randomness(generator, num_rays):
             rendering = model(rays, generator=generator)

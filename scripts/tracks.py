@@ -1,7 +1,7 @@
 """Follow material points of a run and draw them over its pictures: python scripts/tracks.py run=runs/mutant
 
-Writes the sequence, a still of its last picture, the tracks (tracks.npz) and, for runs on an exact scene, the 3-D
-end-point error of the recovered motion (motion.json).
+Writes the sequence, a still of its last picture, a strip of four of its pictures, the tracks (tracks.npz) and, for runs
+on an exact scene, the 3-D end-point error of the recovered motion (motion.json).
 """
 
 from pathlib import Path
@@ -18,16 +18,20 @@ from dnerf.checks import check_choice, check_positive
 from dnerf.data import SyntheticData
 from dnerf.deformations import Deformation
 from dnerf.deformations.fixed_point import jacobians
+from dnerf.evaluation import spread_indices
 from dnerf.files import write_json
 from dnerf.motion import motion_model
 from dnerf.renderer import Renderer
 from dnerf.tracks import render_tracks, seen_points
 from dnerf.video import FORMATS, write_frames, write_png
 
+STRIP = 4
+"""Pictures of the strip."""
+
 
 def main(config: DictConfig) -> None:
     """Load the run, choose and follow points, draw, and measure where the truth is known."""
-    for name in ("num_frames", "fps", "spacing"):
+    for name in ("num_frames", "fps", "spacing", "every"):
         check_positive(name, config[name])
     check_positive("trail", config.trail, allow_zero=True)
     check_choice("format", config.format, FORMATS)
@@ -43,15 +47,19 @@ def main(config: DictConfig) -> None:
     camera = _camera(config, data, device)
     points = seen_points(renderer, camera, config.start, config.spacing, chunk=chunk)
     times = torch.linspace(0, 1, config.num_frames).tolist()
-    tracks, pictures = render_tracks(renderer, camera, points, config.start, times, trail=config.trail, chunk=chunk)
+    tracks, pictures = render_tracks(
+        renderer, camera, points, config.start, times, trail=config.trail, every=config.every, chunk=chunk
+    )
     suffix = "" if config.format == "png" else f".{config.format}"
     output = Path(config.output or Path(config.run) / "renders" / f"tracks{suffix}")
-    frames = list(tqdm(pictures, total=len(times), unit="frame"))
+    frames = list(tqdm(pictures, total=-(-len(times) // config.every), unit="frame"))
     write_frames(frames, output, config.format, fps=config.fps)
     still = write_png(frames[-1], output.parent / f"{output.stem}_still.png")
+    strip = torch.cat([frames[i] for i in spread_indices(len(frames), STRIP)], dim=1)
+    write_png(strip, output.parent / f"{output.stem}_strip.png")
     arrays = {name: getattr(tracks, name).cpu().numpy() for name in ("times", "positions", "residuals")}
     np.savez_compressed(output.parent / f"{output.stem}.npz", **arrays)
-    print(f"{points.shape[0]} tracks over {len(times)} frames: {output}, {still}")
+    print(f"{points.shape[0]} tracks over {len(frames)} frames: {output}, {still}")
     print(f"residual: median {tracks.residuals.median():.2e}, largest {tracks.residuals.max():.2e} world units")
     model = motion_model(renderer)
     if isinstance(model, Deformation):

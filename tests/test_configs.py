@@ -56,11 +56,16 @@ def test_motion_losses_join_the_flow(loss):
     config = composed("experiment=flow", f"+trainer/losses={loss}", "data.train_end=0.8")
     data = instantiate(config.data, _convert_="all")
     trainer = instantiate(config.trainer, _convert_="all")
-    assert set(trainer.losses) == {"rgb", loss}
+    assert set(trainer.losses) == {"rgb", "smooth_velocity", loss}
     terms = []
     renderer = instantiate(config.renderer, _convert_="all")
     trainer.fit(renderer, data.frames("train"), callbacks=[lambda record, _: terms.append(record.losses)])
-    assert set(terms[-1]) == {"loss", "rgb", loss}
+    assert set(terms[-1]) == {"loss", *trainer.losses}
+
+
+def test_a_time_window_joins_any_experiment():
+    trainer = instantiate(composed("experiment=fast", "+trainer/time_window=growing").trainer, _convert_="all")
+    assert trainer.time_window.num_frames(100, 0.0) == 5
 
 
 def test_every_scene_has_a_config_that_builds_it():

@@ -40,6 +40,7 @@ FLOORS = {
     "protocols": 6,
     "records": 6,
     "recovery": 6,
+    "time_window": 6,
     "visualisation": 6,
     # 7: whole runs.
     "checkpoints": 7,

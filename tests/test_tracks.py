@@ -62,6 +62,14 @@ def test_tracks_are_those_of_the_scene(renderer: Renderer) -> None:
     assert heads.any()
 
 
+def test_some_pictures_of_a_sequence_are_drawn_the_last_among_them(renderer: Renderer) -> None:
+    points = seen_points(renderer, CAMERA, 0.0, 10)
+    times = [0.0, 0.05, 0.1, 0.15, 0.2, 0.25]
+    frames, some = (list(render_tracks(renderer, CAMERA, points, 0.0, times, every=n)[1]) for n in (1, 2))
+    assert len(some) == 3
+    assert all(torch.equal(one, other) for one, other in zip(some, frames[1::2]))
+
+
 def test_no_matter_is_named(renderer: Renderer) -> None:
     away = Camera(CAMERA.intrinsics, look_at((0.0, -3.5, 1.5), (0.0, -7.0, 3.0)))
     with pytest.raises(ValueError, match="the picture shows no matter at a spacing of 5 pixels"):

@@ -12,6 +12,7 @@ from dnerf.losses import OpacityEntropyLoss, PhotometricLoss
 from dnerf.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
+from dnerf.time_window import TimeWindow
 from dnerf.training import Trainer
 
 BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
@@ -47,6 +48,18 @@ def test_loss_falls(frames):
     )
     first, last = records[0].losses["loss"], sum(r.losses["loss"] for r in records[-5:]) / 5
     assert last < 0.6 * first
+
+
+def test_a_time_window_begins_with_few_frames(frames):
+    class Watched(TimeWindow):
+        def num_frames(self, count, progress):
+            nums_frames.append(super().num_frames(count, progress))
+            return nums_frames[-1]
+
+    nums_frames: list[int] = []
+    trainer(time_window=Watched(0.5, end=0.5, start=0.1)).fit(small_renderer(), frames)
+    assert nums_frames == sorted(nums_frames)
+    assert nums_frames[0] < nums_frames[10] == nums_frames[-1] == len(frames)
 
 
 def test_same_seed_gives_the_same_weights(frames):

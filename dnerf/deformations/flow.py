@@ -44,6 +44,10 @@ class FlowDeformation(InvertibleDeformation):
     Both are the identity at initialisation if v is zero, both compose: motion from t to t' is
     `inverse(forward(x, t), t')`.
 
+    The exact flow never folds space. Steps of length h keep the Jacobian determinant positive while the norm of the
+    velocity's gradient stays below 1 / h (Euler) or (sqrt(3) - 1) / h (midpoint), h times |t0 - t| if there is a
+    canonical time; `SmoothVelocityLoss` holds it down in training.
+
     Args:
         velocity: the field, zero outside the scene's box.
         canonical_time: t0, or None (frozen clock only).

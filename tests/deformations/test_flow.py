@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dnerf.benchmarks.closed_flows import Rotation, Swirl
 from dnerf.deformations import DisplacementDeformation, FlowDeformation
-from dnerf.deformations.velocities import NetworkVelocity
+from dnerf.deformations.velocities import NetworkVelocity, Velocity
 
 BOX = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
@@ -87,6 +87,28 @@ def test_jacobian_determinant_stays_positive(velocity: NetworkVelocity, clock: s
     flow = flow_of(velocity, torch.float64, clock=clock, solver=solver, num_steps=steps)
     positions, times = points(500, torch.float64)
     assert determinants(flow, positions, times).min() > 0.05
+
+
+class TwoSlopes(Velocity):
+    """Expands by a rate about the origin, which it carries to (1, 0, 0), and contracts by it about (0.5, 0, 0)."""
+
+    def __init__(self, rate: float) -> None:
+        super().__init__()
+        self.rate = rate
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        shift = torch.tensor([1.0, 0.0, 0.0], dtype=positions.dtype)
+        far = positions[..., :1] > 0.25
+        return torch.where(far, -self.rate * (positions - 0.5 * shift), shift + self.rate * positions)
+
+
+@pytest.mark.parametrize(("share", "folds"), [(0.99, False), (1.01, True)])
+def test_one_midpoint_step_cannot_fold_below_the_stated_slope(share: float, folds: bool) -> None:
+    """The worst case: det = (1 - L (1 + L / 2))^3 changes its sign at L = sqrt(3) - 1."""
+    velocity = TwoSlopes(share * (3**0.5 - 1))
+    flow = FlowDeformation(velocity, None, clock="frozen", solver="midpoint", num_steps=1)
+    origin, time = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    assert (determinants(flow, origin, time).item() < 0) == folds
 
 
 def determinants(flow: torch.nn.Module, positions: Tensor, times: Tensor) -> Tensor:

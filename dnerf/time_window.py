@@ -1,0 +1,62 @@
+"""Frames that come in by time: motion is found from one moment outwards, instead of everywhere at once."""
+
+import torch
+from torch import Tensor
+
+from dnerf.checks import check_positive
+
+
+class TimeWindow:
+    """Training begins with the frames nearest in time to an origin; the others come in as it goes on.
+
+    A field that sees all times at once first learns their blur, and may explain motion by matter that comes and goes.
+    Near the origin little has moved; what comes in later lies close to where the deformation already leads.
+    Source: D-NeRF's code (`precrop_iters_time`), there from time 0.
+
+    Args:
+        origin: time in [0, 1] around which the window opens.
+        end: fraction of training, in (0, 1], at which all frames are in.
+        start: share of the frames that are in at first, in (0, 1]; one frame at least.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(self, origin: float = 0.0, end: float = 0.6, start: float = 0.05) -> None:
+        if not 0 <= origin <= 1:
+            raise ValueError(f"origin must be in [0, 1], got {origin}")
+        for name, value in (("end", end), ("start", start)):
+            check_positive(name, value)
+            if value > 1:
+                raise ValueError(f"{name} must be in (0, 1], got {value}")
+        self.origin = origin
+        self.end = end
+        self.start = start
+
+    def num_frames(self, count: int, progress: float) -> int:
+        """How many of `count` frames are in at a progress in [0, 1]."""
+        share = self.start + (1 - self.start) * min(progress / self.end, 1.0)
+        return min(max(round(share * count), 1), count)
+
+    def draw(
+        self, times: Tensor, num_pixels: int, count: int, progress: float, *, generator: torch.Generator
+    ) -> Tensor:
+        """Random pixels of the frames that are in.
+
+        Args:
+            times: (F,) of all frames, in [0, 1].
+            num_pixels: of all frames together, F of equal size one after the other.
+            count: how many to draw, with repetition.
+            progress: of training, in [0, 1].
+            generator: on the device of the times.
+
+        Returns:
+            (count,) int64 in [0, num_pixels). Once all frames are in, what `torch.randint` gives.
+        """
+        num_frames = self.num_frames(len(times), progress)
+        size = num_pixels // len(times)
+        drawn = torch.randint(num_frames * size, (count,), generator=generator, device=generator.device)
+        if num_frames == len(times):
+            return drawn
+        nearest = torch.argsort((times - self.origin).abs(), stable=True)
+        return nearest[drawn // size] * size + drawn % size

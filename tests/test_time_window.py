@@ -1,0 +1,56 @@
+"""The window that lets frames in by time."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.time_window import TimeWindow
+
+SIZE = 6  # pixels of a frame
+
+
+def draw(window: TimeWindow, times: list[float], progress: float, count: int = 2000) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return window.draw(torch.tensor(times), SIZE * len(times), count, progress, generator=generator)
+
+
+def seen(window: TimeWindow, times: list[float], progress: float) -> set[float]:
+    return {times[i] for i in (draw(window, times, progress) // SIZE).tolist()}
+
+
+def test_the_window_opens_from_the_origin_outwards() -> None:
+    times = [0.9, 0.1, 0.5, 0.3, 0.7]
+    window = TimeWindow(0.4, end=0.5, start=0.4)
+    assert seen(window, times, 0.0) == {0.5, 0.3}
+    # Half way there, 0.7 of five frames: 3.5 rounds to the even 4; 0.1 and 0.7 are next.
+    assert seen(window, times, 0.25) == {0.5, 0.3, 0.1, 0.7}
+    assert seen(window, times, 0.5) == {0.5, 0.3, 0.1, 0.7, 0.9}
+
+
+def test_every_pixel_of_the_frames_that_are_in_is_drawn() -> None:
+    indices = draw(TimeWindow(1.0, start=0.5), [0.0, 1.0], 0.0)
+    assert sorted(set(indices.tolist())) == list(range(6, 12))
+
+
+def test_an_open_window_changes_nothing() -> None:
+    drawn = draw(TimeWindow(0.5, end=0.6), [0.0, 0.5, 1.0], 0.6, count=50)
+    assert torch.equal(drawn, torch.randint(3 * SIZE, (50,), generator=torch.Generator().manual_seed(0)))
+
+
+def test_one_frame_is_always_in() -> None:
+    assert TimeWindow(start=0.01).num_frames(3, 0.0) == 1
+    assert TimeWindow(start=0.01).num_frames(3, 1.0) == 3
+    assert seen(TimeWindow(0.2), [0.0, 1.0], 0.0) == {0.0}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"origin": 1.5}, r"origin must be in \[0, 1\], got 1.5"),
+        ({"end": 0.0}, "end must be"),
+        ({"start": 2.0}, r"start must be in \(0, 1\], got 2.0"),
+    ],
+)
+def test_bad_settings_are_refused(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TimeWindow(**arguments)
