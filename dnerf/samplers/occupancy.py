@@ -32,6 +32,10 @@ class OccupancySampler(Sampler):
     Args:
         box: (2, 3) corners of the space that is sampled, in world units.
         step_size: length of an interval, in world units.
+        coarse_step: length of an interval when training begins; it shrinks evenly (by equal factors in equal progress)
+            to `step_size`. Long intervals clear haze early and see more rays for the same samples, short ones
+            sharpen surfaces later. None for `step_size` from the start; evaluation always takes `step_size`.
+        coarse_until: fraction of training, in (0, 1], at which `step_size` is reached.
         resolution: cells along the box's longest side; cells are nearly cubes.
         num_slabs: slabs that time is cut into, K.
         threshold: density, in 1 / world unit, above which a cell is occupied.
@@ -59,6 +63,8 @@ class OccupancySampler(Sampler):
         step_size: float = 0.02,
         resolution: int = 64,
         *,
+        coarse_step: float | None = None,
+        coarse_until: float = 0.5,
         num_slabs: int = 16,
         threshold: float = 1.0,
         decay: float = 0.8,
@@ -73,6 +79,8 @@ class OccupancySampler(Sampler):
         super().__init__()
         for name, value in (
             ("step_size", step_size),
+            ("coarse_step", step_size if coarse_step is None else coarse_step),
+            ("coarse_until", coarse_until),
             ("resolution", resolution),
             ("num_slabs", num_slabs),
             ("threshold", threshold),
@@ -82,6 +90,8 @@ class OccupancySampler(Sampler):
             ("pad_to", pad_to),
         ):
             check_positive(name, value)
+        if coarse_until > 1:
+            raise ValueError(f"coarse_until must be in (0, 1], got {coarse_until}")
         if not 0 < decay < 1:
             raise ValueError(f"decay must be in (0, 1), got {decay}")
         for name, value in (("margin", margin), ("render_margin", render_margin)):
@@ -91,6 +101,9 @@ class OccupancySampler(Sampler):
         sides = corners[1] - corners[0]
         cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
         self.step_size = step_size
+        self.coarse_step = step_size if coarse_step is None else coarse_step
+        self.coarse_until = coarse_until
+        self.training_step = self.coarse_step
         self.threshold = threshold
         self.decay = decay
         self.update_every = update_every
@@ -136,7 +149,7 @@ class OccupancySampler(Sampler):
             jitter=jitter,
             occupancy=occupied,
             aabb=self.box,
-            step=self.step_size,
+            step=self.training_step if self.training else self.step_size,
             skips=skips,
         )
         samples = Samples(
@@ -145,6 +158,11 @@ class OccupancySampler(Sampler):
         if self.training and self.min_weight > 0:
             samples = self._visible(samples, rays, field)
         return samples.padded(self.pad_to)
+
+    def set_progress(self, progress: float) -> None:
+        """Shorten the intervals of training to where it stands, `progress` in [0, 1]."""
+        part = min(progress / self.coarse_until, 1.0)
+        self.training_step = self.coarse_step * (self.step_size / self.coarse_step) ** part
 
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
         asked, number = joined(samples, self.filter_joins)

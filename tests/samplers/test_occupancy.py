@@ -93,6 +93,23 @@ def test_a_filled_grid_keeps_its_margin_in_pictures() -> None:
     assert sampler.rendered.equal(sampler.occupied)
 
 
+def test_intervals_of_training_shrink_to_those_of_pictures() -> None:
+    sampler = small(coarse_step=0.08, coarse_until=0.5)
+    rays = rays_towards_origin(20)
+
+    def length() -> float:
+        samples = sampler(rays, fog(1.0), generator=torch.Generator().manual_seed(0))
+        return float(samples.lengths.median())
+
+    lengths = []
+    for progress in (0.0, 0.25, 0.5, 1.0):
+        sampler.train().set_progress(progress)
+        lengths.append(length())
+        assert sampler.eval() is sampler
+        assert length() == pytest.approx(0.02, rel=1e-4)
+    assert lengths == pytest.approx([0.08, 0.04, 0.02, 0.02], rel=1e-4)
+
+
 def test_cells_can_be_set() -> None:
     sampler = small(render_margin=0)
     sampler.occupy(torch.tensor(False))
