@@ -194,7 +194,11 @@ def test_grid_is_saved_with_the_model() -> None:
         ({"update_every": 0}, "update_every must be > 0"),
         ({"threshold": 0.0}, "threshold must be > 0"),
         ({"decay": 1.0}, r"decay must be in \(0, 1\)"),
-        ({"margin": 2}, "margin must be 0 or 1"),
+        ({"margin": 2}, "^margin must be 0 or 1"),
+        ({"render_margin": 2}, "render_margin must be 0 or 1"),
+        ({"coarse_step": 0.0}, "coarse_step must be > 0"),
+        ({"coarse_until": 1.5}, r"coarse_until must be in \(0, 1\]"),
+        ({"filter_joins": 0}, "filter_joins must be > 0"),
     ],
 )
 def test_numbers_out_of_range_are_refused(options: dict, message: str) -> None:
