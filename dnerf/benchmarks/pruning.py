@@ -17,7 +17,7 @@ from dnerf.fields import DeformedField
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
 
-PROBES = 4
+PROBES = 2
 FLOOR = 1e-8  # error that is drawn for none
 
 KNOBS = {
