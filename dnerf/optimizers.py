@@ -1,7 +1,8 @@
-"""Adam, with orthogonalised momentum for the matrices of networks that ask for it."""
+"""Adam, with orthogonalised momentum for the matrices of networks that ask for it, and schedules of its rates."""
 
+import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 # A quintic whose iteration takes every singular value in (0, 1] to 0.7 ... 1.2 within five rounds (Jordan 2024).
 QUINTIC = (3.4445, -4.7750, 2.0315)
 ROUNDS = 5
+SCHEDULES = ("exponential", "cosine", "constant")
 RMS_OF_ADAM = 0.2  # root mean square of Adam's updates, in learning rates (Liu et al. 2025, section 2.2)
 
 
@@ -72,6 +74,40 @@ class AdamMuon(torch.optim.Adam):
                     raise ValueError(f"orthogonal parameters must be matrices, got shape {tuple(parameter.shape)}")
         super().__init__(listed, lr=lr, betas=betas, eps=eps, fused=fused)
 
+    @classmethod
+    def of(
+        cls,
+        model: nn.Module,
+        rates: Mapping[str, float],
+        *,
+        orthogonal: Sequence[str] = (),
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ) -> "AdamMuon":
+        """An optimiser of a model's parameters, which also notes the groups' rates as "initial_lr".
+
+        Args:
+            model: whose parameters are optimised.
+            rates: learning rates by parameter-name prefix; "" is the default, the longest match wins.
+            orthogonal: prefixes below which the weights of linear maps of 16 rows and columns or more are orthogonal.
+            betas: Adam's moment decay rates.
+            eps: Adam's epsilon.
+        """
+        matrices = {
+            f"{name}.weight"
+            for name, module in model.named_modules()
+            if isinstance(module, nn.Linear) and name.startswith(tuple(orthogonal)) and min(module.weight.shape) >= 16
+        }
+        groups: dict[tuple[str, bool], list[nn.Parameter]] = defaultdict(list)
+        for name, parameter in model.named_parameters():
+            prefix = max((p for p in rates if name.startswith(p)), key=len)
+            groups[prefix, name in matrices].append(parameter)
+        listed = [
+            {"params": groups[key], "lr": rates[key[0]], "initial_lr": rates[key[0]], "orthogonal": key[1]}
+            for key in sorted(groups)
+        ]
+        return cls(listed, betas=betas, eps=eps, fused=True)
+
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One step on all parameters that have a gradient, as of Adam."""
@@ -113,3 +149,21 @@ def moments_of(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> fro
         if any(member is parameter for member in group["params"]):
             return frozenset({"step", "exp_avg"} | (set() if group.get("orthogonal") else {"exp_avg_sq"}))
     raise ValueError("the parameter must be one of the optimiser's")
+
+
+def rate_factor(schedule: str, final: float, warmup_steps: int, progress: float, step: int) -> float:
+    """What learning rates are multiplied by.
+
+    Args:
+        schedule: one of `SCHEDULES`.
+        final: the factor at the end of "exponential" and "cosine".
+        warmup_steps: steps over which the factor rises linearly from near zero.
+        progress: of training, in [0, 1].
+        step: steps done.
+    """
+    warmup = min(1.0, (step + 1) / (warmup_steps + 1))
+    if schedule == "exponential":
+        return warmup * final**progress
+    if schedule == "cosine":
+        return warmup * (final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress)))
+    return warmup

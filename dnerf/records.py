@@ -1,12 +1,17 @@
 """What a step of training looked like: its numbers, whether they make sense, and one line for the eye."""
 
+import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
+
+from dnerf.renderer import Renderer
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -83,3 +88,15 @@ def check_finite(numbers: Mapping[str, float], step: int, renderer: nn.Module) -
 def not_finite(renderer: nn.Module) -> list[str]:
     """Names of the parameters that hold NaN or infinity."""
     return [name for name, p in renderer.named_parameters() if not bool(torch.isfinite(p).all())]
+
+
+Callback = Callable[[TrainingRecord, Renderer], None]
+
+
+def report(record: TrainingRecord, renderer: Renderer, callbacks: Sequence[Callback]) -> None:
+    """Call the callbacks; one that cannot write (a full disk) costs its output, not the run."""
+    for callback in callbacks:
+        try:
+            callback(record, renderer)
+        except OSError as error:
+            logger.warning("step %d: %s failed: %s", record.step, type(callback).__name__, error)

@@ -4,7 +4,8 @@ import hashlib
 import logging
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -270,3 +271,16 @@ def max_bytes(modules: Mapping[str, nn.Module]) -> int:
     """Most bytes a checkpoint of these modules can take: their tensors, and two moments and a step per parameter."""
     tensors = {f"{k}.{n}": value for k, module in modules.items() for n, value in module.state_dict().items()}
     return 3 * num_bytes(tensors) + 64 * len(tensors) + MAX_HEADER
+
+
+@contextmanager
+def advice_on_memory(run: RunState) -> Iterator[None]:
+    """Turn a GPU's lack of memory within a `with` block into an error that says what to lower."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise MemoryError(
+            f"step {run.step + 1}: the GPU's memory does not suffice for {run.num_rays} rays; lower trainer.num_rays, "
+            "trainer.target_samples or trainer.max_rays, or set renderer.precision=bfloat16; a checkpoint, if there "
+            f"is one, is good ({' '.join(str(error).split())[:120]})"
+        ) from error

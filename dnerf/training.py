@@ -1,10 +1,9 @@
 """Training a renderer on frames: random rays over all frames, Adam, schedules that follow steps and seconds."""
 
 import logging
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from signal import Signals
 
 import torch
@@ -16,21 +15,17 @@ from dnerf.checks import check_choice, check_positive
 from dnerf.data.frames import Frames, composite_on
 from dnerf.distributed import Processes
 from dnerf.losses import Loss, PhotometricLoss
-from dnerf.optimizers import AdamMuon
-from dnerf.records import Outcome, TrainingRecord, check_finite, psnr_of, show
+from dnerf.optimizers import SCHEDULES, AdamMuon, rate_factor
+from dnerf.records import Callback, Outcome, TrainingRecord, check_finite, psnr_of, report, show
 from dnerf.recovery import SHOWN, Recovery, what_is_shown
 from dnerf.renderer import Renderer
-from dnerf.run_state import CheckpointFolder, RunState, fingerprint, max_bytes
+from dnerf.run_state import CheckpointFolder, RunState, advice_on_memory, fingerprint, max_bytes
 from dnerf.stopping import StopRequest, TrainingStopped, stop_requests
 from dnerf.time_window import TimeWindow
 
 logger = logging.getLogger(__name__)
 
 BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
-SCHEDULES = ("exponential", "cosine", "constant")
-
-
-Callback = Callable[[TrainingRecord, Renderer], None]
 
 
 class Trainer:
@@ -161,7 +156,7 @@ class Trainer:
         frames = frames.to(renderer.device)
         generator = torch.Generator(renderer.device).manual_seed(seed)
         modules = {"renderer": renderer, "losses": self.losses}
-        run = RunState(modules, self._optimizer(renderer), generator, max(self.num_rays, processes.size))
+        run = RunState(modules, self.optimizer(renderer), generator, max(self.num_rays, processes.size))
         if checkpoints is not None:
             run.data = fingerprint(frames)
         renderer.train()
@@ -173,12 +168,18 @@ class Trainer:
         catching = nullcontext(StopRequest()) if checkpoints is None else stop_requests()
         is_shown = self.progress_bar and processes.is_first
         bar = tqdm(total=100, disable=not is_shown, dynamic_ncols=True, bar_format=BAR)
-        with bar, catching as request, processes.watched(), _advice_on_memory(run):
+        with bar, catching as request, processes.watched(), advice_on_memory(run):
             self._loop(run, renderer, frames, processes, callbacks, checkpoints, request, bar)
         renderer.set_progress(1.0)
         renderer.eval()
         assert run.record is not None
         return TrainingRecord(**run.record)
+
+    def optimizer(self, renderer: Renderer) -> AdamMuon:
+        """A fresh optimiser of the model's parameters."""
+        return AdamMuon.of(
+            renderer, self.learning_rates, orthogonal=self.orthogonal, betas=self.betas, eps=self.epsilon
+        )
 
     def _loop(
         self,
@@ -207,7 +208,7 @@ class Trainer:
             if saves or run.step == 1 or ends or run.step % self.log_every == 0:
                 record = self._examined(run, outcome, processes, used_rays, num_samples)
                 if record is not None and processes.is_first:
-                    _report(record, renderer, callbacks)
+                    report(record, renderer, callbacks)
                     show(bar, record, self._progress(run), run.rays_done)
             if checkpoints is not None and saves:
                 processes.merge_observations(renderer)
@@ -251,7 +252,7 @@ class Trainer:
         renderer, progress = run.modules["renderer"], self._progress(run)
         assert isinstance(renderer, Renderer)
         renderer.set_progress(progress)
-        factor = self._learning_rate_factor(progress, run.step)
+        factor = rate_factor(self.schedule, self.final_learning_rate, self.warmup_steps, progress, run.step)
         for group in run.optimizer.param_groups:
             group["lr"] = group["initial_lr"] * factor * (1.0 if self.recovery is None else self.recovery.factor)
         processes.merge_observations(renderer, run.step)
@@ -280,26 +281,6 @@ class Trainer:
         detached = {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse, **shown}.items()}
         return Outcome(detached, weight, rendering.samples.starts.numel(), factor)
 
-    def _optimizer(self, renderer: Renderer) -> AdamMuon:
-        matrices = {
-            id(module.weight)
-            for name, module in renderer.named_modules()
-            if isinstance(module, nn.Linear) and name.startswith(self.orthogonal) and min(module.weight.shape) >= 16
-        }
-        groups: dict[tuple[str, bool], list[nn.Parameter]] = {
-            (prefix, is_matrix): [] for prefix in self.learning_rates for is_matrix in (False, True)
-        }
-        for name, parameter in renderer.named_parameters():
-            prefix = max((p for p in self.learning_rates if name.startswith(p)), key=len)
-            groups[prefix, id(parameter) in matrices].append(parameter)
-        listed = [
-            {"params": group, "lr": rate, "initial_lr": rate, "orthogonal": is_matrix}
-            for (prefix, is_matrix), group in groups.items()
-            if group
-            for rate in (self.learning_rates[prefix],)
-        ]
-        return AdamMuon(listed, betas=self.betas, eps=self.epsilon, fused=True)
-
     def _next_num_rays(self, num_rays: int, num_samples: int) -> int:
         if self.target_samples is None:
             return num_rays
@@ -322,33 +303,3 @@ class Trainer:
     def _progress(self, run: RunState) -> float:
         of_time = 0.0 if self.max_seconds is None else run.seconds / self.max_seconds
         return min(max(run.step / self.num_steps, of_time), 1.0)
-
-    def _learning_rate_factor(self, progress: float, step: int) -> float:
-        warmup = min(1.0, (step + 1) / (self.warmup_steps + 1))
-        if self.schedule == "exponential":
-            return warmup * self.final_learning_rate**progress
-        if self.schedule == "cosine":
-            cosine = 0.5 * (1 + math.cos(math.pi * progress))
-            return warmup * (self.final_learning_rate + (1 - self.final_learning_rate) * cosine)
-        return warmup
-
-
-def _report(record: TrainingRecord, renderer: Renderer, callbacks: Sequence[Callback]) -> None:
-    """Call the callbacks; one that cannot write (a full disk) costs its output, not the run."""
-    for callback in callbacks:
-        try:
-            callback(record, renderer)
-        except OSError as error:
-            logger.warning("step %d: %s failed: %s", record.step, type(callback).__name__, error)
-
-
-@contextmanager
-def _advice_on_memory(run: RunState) -> Iterator[None]:
-    try:
-        yield
-    except torch.OutOfMemoryError as error:
-        raise MemoryError(
-            f"step {run.step + 1}: the GPU's memory does not suffice for {run.num_rays} rays; lower trainer.num_rays, "
-            "trainer.target_samples or trainer.max_rays, or set renderer.precision=bfloat16; a checkpoint, if there "
-            f"is one, is good ({' '.join(str(error).split())[:120]})"
-        ) from error

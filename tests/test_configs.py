@@ -63,6 +63,18 @@ def test_motion_losses_join_the_flow(loss):
     assert set(terms[-1]) == {"loss", *trainer.losses}
 
 
+@pytest.mark.parametrize("experiment", ["fast", "flow"])
+def test_the_networks_that_move_matter_take_orthogonalised_steps(experiment):
+    """A prefix that matches nothing is no error, so a renamed module would go unnoticed."""
+    config = composed(f"experiment={experiment}")
+    renderer = instantiate(config.renderer, _convert_="all")
+    optimizer = instantiate(config.trainer, _convert_="all").optimizer(renderer)
+    names = {id(p): name for name, p in renderer.named_parameters()}
+    matrices = [names[id(p)] for group in optimizer.param_groups if group["orthogonal"] for p in group["params"]]
+    assert len(matrices) >= 3
+    assert all(name.startswith("field.deformation.") for name in matrices)
+
+
 def test_a_time_window_joins_any_experiment():
     trainer = instantiate(composed("experiment=fast", "+trainer/time_window=growing").trainer, _convert_="all")
     assert trainer.time_window.num_frames(100, 0.0) == 5

@@ -44,7 +44,7 @@ def trainer(**changes: Any) -> Trainer:
 
 
 def state_of(renderer: Renderer, step: int = 5) -> RunState:
-    optimizer = trainer()._optimizer(renderer)
+    optimizer = trainer().optimizer(renderer)
     generator = torch.Generator().manual_seed(4)
     for parameter in renderer.parameters():
         parameter.grad = torch.rand(parameter.shape, generator=generator)

@@ -98,6 +98,7 @@ def test_pictures_hardly_change_and_training_does_not_see_it(packed: bool) -> No
     pictures = [Renderer(field, sampler).render_image(camera, 0.6).rgb for field in (exact, cached)]
     assert pictures[0].std() > 0.01
     torch.testing.assert_close(pictures[0], pictures[1], rtol=0, atol=2e-3)
+    assert not torch.equal(*pictures)  # the lattice was asked
     rays = camera.rays(0.6)[:50]
     seen = [Renderer(field, sampler).eval()(rays).rgb for field in (exact, cached)]
     assert torch.equal(*seen)

@@ -11,30 +11,29 @@ import torch
 from dnerf.metrics.perceptual import BACKBONES, lpips_metric
 
 
-def test_a_missing_extra_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (ImportError("No module named 'torchvision'"), r"lpips needs the extra: pip install 'dnerf\[lpips\]'"),
+        # PyPI's torchvision next to a CPU torch.
+        (
+            RuntimeError("operator torchvision::nms does not exist"),
+            r"torchvision does not fit torch .*nms does not exist.*same index",
+        ),
+    ],
+)
+def test_a_missing_extra_or_one_of_another_build_is_explained(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, message: str
+) -> None:
     real = builtins.__import__
 
     def without_torchvision(name: str, *arguments: object, **options: object) -> object:
         if name == "torchvision":
-            raise ImportError("No module named 'torchvision'")
+            raise error
         return real(name, *arguments, **options)
 
     monkeypatch.setattr(builtins, "__import__", without_torchvision)
-    with pytest.raises(ValueError, match=r"lpips needs the extra: pip install 'dnerf\[lpips\]'"):
-        lpips_metric()
-
-
-def test_a_torchvision_of_another_build_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PyPI's torchvision next to a CPU torch: its import raises RuntimeError, not ImportError."""
-    real = builtins.__import__
-
-    def broken_torchvision(name: str, *arguments: object, **options: object) -> object:
-        if name == "torchvision":
-            raise RuntimeError("operator torchvision::nms does not exist")
-        return real(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", broken_torchvision)
-    with pytest.raises(ValueError, match=r"torchvision does not fit torch .*nms does not exist.*same index"):
+    with pytest.raises(ValueError, match=message):
         lpips_metric()
 
 
