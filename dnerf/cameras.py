@@ -155,16 +155,47 @@ class Camera:
         rows = center_y - offset - local[..., 1] / depth * camera.focal_y
         return torch.stack([columns, rows], dim=-1), depth
 
-    def rays(self, time: float) -> Rays:
-        """Rays of all pixels in row order, (height * width) of them, at one time in [0, 1]."""
-        size = self.intrinsics.width * self.intrinsics.height
-        pixels = torch.arange(size, device=self.pose.device)
+    def pixels_around(self, groups: Tensor) -> Tensor | None:
+        """Pixels inside the rectangles that groups of points span on the picture.
+
+        The rays that hit the convex hull of a group are among them.
+
+        Args:
+            groups: (M, K, 3) world positions.
+
+        Returns:
+            Pixel numbers (P,) int64, `row * width + column`, in order; None if a point does not lie before the camera.
+        """
+        positions, depth = self.project(groups)
+        if not bool((depth > 0).all() & positions.isfinite().all()):
+            return None
+        width, height = self.intrinsics.width, self.intrinsics.height
+        size = torch.tensor([width, height], device=positions.device, dtype=positions.dtype)
+        low = torch.minimum(positions.amin(1).floor().clamp(min=0), size).long()
+        high = torch.minimum(positions.amax(1).ceil().clamp(min=-1) + 1, size).long()
+        # How many rectangles hold a pixel is the sum of +1 and -1 at corners, over all that is above and to its left.
+        changes = torch.zeros(height + 1, width + 1, device=positions.device)
+        one = torch.ones((), device=positions.device)
+        for rows, columns, sign in ((low, low, one), (high, low, -one), (low, high, -one), (high, high, one)):
+            changes.index_put_((rows[:, 1], columns[:, 0]), sign, accumulate=True)
+        held = changes.cumsum(0).cumsum(1)[:height, :width] > 0.5
+        return held.reshape(-1).nonzero()[:, 0]
+
+    def rays(self, time: float, pixels: Tensor | None = None) -> Rays:
+        """Rays of pixels at one time.
+
+        Args:
+            time: in [0, 1].
+            pixels: (P,) int64, `row * width + column`; None for all height * width of them, in this order.
+        """
+        if pixels is None:
+            pixels = torch.arange(self.intrinsics.width * self.intrinsics.height, device=self.pose.device)
         return camera_rays(
             self.intrinsics,
             self.pose,
             pixels % self.intrinsics.width,
             pixels // self.intrinsics.width,
-            times=torch.full((size,), time, dtype=self.pose.dtype, device=self.pose.device),
+            times=torch.full((len(pixels),), time, dtype=self.pose.dtype, device=self.pose.device),
             near=self.near,
             far=self.far,
         )

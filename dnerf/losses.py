@@ -1,13 +1,17 @@
 """Training losses: each looks at a rendering and its target and returns one number."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import check_choice, check_positive
+from dnerf.checks import as_box, check_choice, check_positive
 from dnerf.compositing import Rendering
+from dnerf.fields import DeformedField
 from dnerf.renderer import Renderer
+
+SHARE_THAT_IS_SEEN = 1e-3
 
 
 class Loss(nn.Module, ABC):
@@ -75,3 +79,86 @@ class OpacityEntropyLoss(Loss):
         opacity = rendering.opacity.clamp(1e-4, 1 - 1e-4)
         entropy = -(opacity * torch.log(opacity) + (1 - opacity) * torch.log1p(-opacity))
         return self.weight * entropy.mean()
+
+
+class HiddenMatterLoss(Loss):
+    """Opacity of canonical matter that no ray sees, at random places where the sampler thinks that matter may be.
+
+    A field invents matter where no training ray reaches (below the ground, inside bodies), and views from elsewhere
+    show it. What rays see is left alone: a cell of canonical space in which a sample had a share in a picture within
+    the last `memory` steps costs nothing. Inside opaque matter there is no gradient, `1 - exp(-density length)` is
+    flat there; none reaches the deformation.
+
+    Without effect for samplers that do not know where matter is, see `Sampler.places`.
+
+    Source: a sparsity prior as of Plenoxels (arXiv 2112.05131) eq. 5, restricted to what is hidden, with NeRF's opacity
+    (eq. 3) for their Cauchy logarithm.
+
+    Args:
+        box: (2, 3) corners of the canonical space that is kept account of, in world units.
+        weight: factor of the mean opacity.
+        num_points: places of each step.
+        length: of the intervals, in world units.
+        resolution: cells along each side of the box.
+        memory: steps after which a cell that had no share in a picture counts as hidden.
+
+    Raises:
+        ValueError: for numbers that are not positive, or a negative weight; when used, for a field that is not
+            deformed.
+    """
+
+    def __init__(
+        self,
+        box: Sequence[Sequence[float]],
+        weight: float = 1e-2,
+        num_points: int = 1024,
+        *,
+        length: float = 0.02,
+        resolution: int = 64,
+        memory: int = 256,
+    ) -> None:
+        super().__init__()
+        check_positive("weight", weight, allow_zero=True)
+        for name, value in (
+            ("num_points", num_points), ("length", length), ("resolution", resolution), ("memory", memory)
+        ):  # fmt: skip
+            check_positive(name, value)
+        self.weight = weight
+        self.num_points = num_points
+        self.length = length
+        self.memory = memory
+        self.register_buffer("box", as_box(box), persistent=False)
+        self.register_buffer("num_calls", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("last_seen", torch.full((resolution,) * 3, -memory - 1, dtype=torch.int64))
+        self.box: Tensor
+        self.num_calls: Tensor
+        self.last_seen: Tensor
+
+    def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
+        """Weighted mean opacity; other places at every call, the same again after a run is continued."""
+        field = renderer.field
+        if not isinstance(field, DeformedField):
+            raise ValueError(f"HiddenMatterLoss needs a deformed field, got {type(field).__name__}")
+        assert rendering.output is not None
+        assert rendering.weights is not None
+        self.to(rendering.rgb.device)
+        self.num_calls += 1
+        seen = rendering.output.extras["canonical_positions"].detach()[rendering.weights > SHARE_THAT_IS_SEEN]
+        self.last_seen.view(-1)[self._cells(seen)] = self.num_calls
+        generator = torch.Generator(seen.device).manual_seed(int(self.num_calls))
+        places = renderer.sampler.places(self.num_points, generator)
+        if places is None:
+            return rendering.rgb.new_zeros(())
+        with torch.no_grad(), renderer.autocast(seen.device):
+            canonical = field.deformation(*places)
+        is_hidden = self.num_calls - self.last_seen.view(-1)[self._cells(canonical)] > self.memory
+        with renderer.autocast(seen.device):
+            density = field.canonical.density(canonical, places[1])
+        return self.weight * (is_hidden * -torch.expm1(-self.length * density)).mean()
+
+    def _cells(self, positions: Tensor) -> Tensor:
+        """Numbers (N,) of the cells of positions (N, 3); outside the box, of the nearest."""
+        size = self.last_seen.shape[0]
+        unit = (positions - self.box[0]) / (self.box[1] - self.box[0])
+        x, y, z = (unit * size).long().clamp(0, size - 1).unbind(-1)
+        return (x * size + y) * size + z

@@ -1,21 +1,27 @@
-"""Losses that a flow makes natural, each optional: smooth, slow to change, volume-keeping, cycle-consistent motion.
+"""Losses about motion, each optional: elastic for any deformation; for flows smooth, slow to change, volume-keeping,
+cycle-consistent.
 
 They look at some of a batch's own samples, weighted by their share in the picture: motion of empty space is free.
 Derivatives in space and time are finite differences, since compiled kernels are differentiable once.
 """
 
+import math
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dnerf.checks import check_positive
 from dnerf.compositing import Rendering
-from dnerf.deformations import FlowDeformation, LatticeFlow, SkippingFlow
+from dnerf.deformations import Deformation, FlowDeformation, LatticeFlow, SkippingFlow
 from dnerf.fields import DeformedField
 from dnerf.losses import Loss
 from dnerf.renderer import Renderer
+
+LEAST_STRETCH = 0.01
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 @dataclass(frozen=True)
@@ -33,15 +39,15 @@ class MotionPoints:
     shares: Tensor
 
 
-class MotionLoss(Loss):
-    """A term about the motion of a flow, `weight` times the mean over points, weighted by their shares.
+class DeformationLoss(Loss):
+    """A term about a deformation, `weight` times the mean over points, weighted by their shares.
 
     Args:
         weight: factor of the term.
         num_points: at most so many samples of each batch are looked at, evenly spread over it.
 
     Raises:
-        ValueError: for a negative weight or no points; when used, for a renderer whose deformation is no flow.
+        ValueError: for a negative weight or no points; when used, for a renderer without a deformation.
     """
 
     def __init__(self, weight: float, num_points: int = 1024) -> None:
@@ -53,23 +59,18 @@ class MotionLoss(Loss):
 
     def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
         """The weighted mean of `penalty`."""
-        flow = self._flow(renderer)
+        deformation = self._deformation(renderer)
         points = self._points(rendering)
-        return self.weight * (points.shares * self.penalty(flow, points)).sum()
+        return self.weight * (points.shares * self.penalty(deformation, points)).sum()
 
     @abstractmethod
-    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
+    def penalty(self, deformation: Any, points: MotionPoints) -> Tensor:
         """What is wrong at each point, (M,)."""
 
-    def _flow(self, renderer: Renderer) -> FlowDeformation:
-        deformation = renderer.field.deformation if isinstance(renderer.field, DeformedField) else None
-        if isinstance(deformation, LatticeFlow | SkippingFlow):
-            deformation = deformation.flow
-        if not isinstance(deformation, FlowDeformation):
-            raise ValueError(
-                f"{type(self).__name__} needs a renderer whose deformation is a flow, got {type(deformation).__name__}"
-            )
-        return deformation
+    def _deformation(self, renderer: Renderer) -> Deformation:
+        if not isinstance(renderer.field, DeformedField):
+            raise ValueError(f"{type(self).__name__} needs a deformed field, got {type(renderer.field).__name__}")
+        return renderer.field.deformation
 
     def _points(self, rendering: Rendering) -> MotionPoints:
         assert rendering.output is not None
@@ -81,12 +82,66 @@ class MotionLoss(Loss):
         return MotionPoints(positions[::every], rendering.output.extras["times"].reshape(-1)[::every], shares)
 
 
+class ElasticLoss(DeformationLoss):
+    """Squared logarithm of how much the deformation stretches: matter should keep its lengths and must not fold.
+
+    For a deformation D: `(log |D(x + h u, t) - D(x, t)| / h)^2`, u another unit direction at each point. It is zero
+    for rigid motion and grows towards a collapsed direction, which a map that folds has to pass through.
+
+    Source: the elastic regularisation of Nerfies (arXiv 2011.12948) eq. 6; deviation: the stretch along one direction
+    a point, from finite differences, instead of all singular values of the Jacobian.
+
+    Args:
+        weight: factor of the term.
+        num_points: see `DeformationLoss`.
+        distance: of the differences, h, in world units.
+
+    Raises:
+        ValueError: as `DeformationLoss`, and for a distance that is not positive.
+    """
+
+    def __init__(self, weight: float = 1e-3, num_points: int = 1024, *, distance: float = 0.02) -> None:
+        super().__init__(weight, num_points)
+        check_positive("distance", distance)
+        self.distance = distance
+
+    def penalty(self, deformation: Deformation, points: MotionPoints) -> Tensor:
+        """Squared logarithm of the stretch; of a collapsed direction as of a hundredth of its length."""
+        steps = self.distance * spread_directions(points.positions)
+        ends = torch.cat([points.positions, points.positions + steps])
+        here, there = deformation(ends, points.times.repeat(2)).chunk(2)
+        squared = ((there - here) / self.distance).square().sum(-1)
+        return (0.5 * torch.log(squared + LEAST_STRETCH**2)).square()
+
+
+class MotionLoss(DeformationLoss):
+    """A term about the motion of a flow.
+
+    Args:
+        weight: factor of the term.
+        num_points: see `DeformationLoss`.
+
+    Raises:
+        ValueError: as `DeformationLoss`, and when used, for a renderer whose deformation is no flow.
+    """
+
+    def _deformation(self, renderer: Renderer) -> FlowDeformation:
+        deformation = renderer.field.deformation if isinstance(renderer.field, DeformedField) else None
+        if isinstance(deformation, LatticeFlow | SkippingFlow):
+            deformation = deformation.flow
+        if not isinstance(deformation, FlowDeformation):
+            raise ValueError(
+                f"{type(self).__name__} needs a renderer whose deformation is a flow, got {type(deformation).__name__}"
+            )
+        return deformation
+
+
 class SmoothVelocityLoss(MotionLoss):
     """Squared spatial change of the velocity, |grad v|^2 = sum_ij (dv_i / dx_j)^2, in 1 / time^2.
 
     Args:
         weight: factor of the term.
-        num_points: see `MotionLoss`.
+        num_points: see `DeformationLoss`.
         distance: of the forward differences, in world units.
     """
 
@@ -108,7 +163,7 @@ class DivergenceLoss(MotionLoss):
 
     Args:
         weight: factor of the term.
-        num_points: see `MotionLoss`.
+        num_points: see `DeformationLoss`.
         distance: half the span of the central differences, in world units.
     """
 
@@ -135,7 +190,7 @@ class AccelerationLoss(MotionLoss):
 
     Args:
         weight: factor of the term.
-        num_points: see `MotionLoss`.
+        num_points: see `DeformationLoss`.
         interval: between the three times, in (0, 0.5].
     """
 
@@ -162,7 +217,7 @@ class CycleConsistencyLoss(MotionLoss):
 
     Args:
         weight: factor of the term.
-        num_points: see `MotionLoss`.
+        num_points: see `DeformationLoss`.
     """
 
     def __init__(self, weight: float = 1.0, num_points: int = 1024) -> None:
@@ -172,6 +227,15 @@ class CycleConsistencyLoss(MotionLoss):
         """Squared distance after the round trip by the uncorrected inverse."""
         back = flow.reverse(flow(points.positions, points.times), points.times)
         return (back - points.positions).square().sum(-1)
+
+
+def spread_directions(like: Tensor) -> Tensor:
+    """Unit directions (M, 3), one for each row of the input, spread evenly over the sphere (a Fibonacci lattice)."""
+    number = torch.arange(len(like), dtype=like.dtype, device=like.device)
+    height = 1 - (2 * number + 1) / max(len(like), 1)
+    radius = (1 - height.square()).clamp(min=0).sqrt()
+    angle = GOLDEN_ANGLE * number
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), height], dim=-1)
 
 
 def _steps(like: Tensor, distance: float) -> Tensor:

@@ -75,14 +75,14 @@ class Renderer(nn.Module):
             rays: R rays.
             generator: randomness of samplers and backgrounds in training mode.
         """
-        with self._autocast(rays.origins.device):
+        with self.autocast(rays.origins.device):
             samples = self.sampler(rays, self.field, generator=generator)
         return self._render(rays, samples, self.field, generator)
 
     def _render(
         self, rays: Rays, samples: Samples, field: RadianceField, generator: torch.Generator | None = None
     ) -> Rendering:
-        with self._autocast(rays.origins.device):
+        with self.autocast(rays.origins.device):
             positions, directions, times = samples.locate(rays)
             output = field(positions, directions, times)
         if self.training:
@@ -98,14 +98,14 @@ class Renderer(nn.Module):
 
     def _without_gradients(self, rays: Rays, field: RadianceField) -> Rendering:
         """What `forward` shows of a field, without per-sample data: rays end where they are opaque."""
-        with self._autocast(rays.origins.device):
+        with self.autocast(rays.origins.device):
             samples = self.sampler(rays, field)
         if not samples.is_packed or self.stop_transmittance == 0 or self.quadrature != "constant":
             return self._render(rays, samples, field)
         sums = rays.origins.new_zeros(len(rays), 5)
 
         def visit(ray_numbers: Tensor, chosen: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
-            with self._autocast(rays.origins.device):
+            with self.autocast(rays.origins.device):
                 output = field(*part.locate(rays[ray_numbers]))
             seen = composite(part, output)
             columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
@@ -119,10 +119,11 @@ class Renderer(nn.Module):
 
     def update(self, step: int) -> None:
         """Let the sampler learn from the field, between training steps; `step` counts those done."""
-        with self._autocast(self.device):
+        with self.autocast(self.device):
             self.sampler.update(self.field, step)
 
-    def _autocast(self, device: torch.device) -> torch.autocast:
+    def autocast(self, device: torch.device) -> torch.autocast:
+        """A context in which networks run in the renderer's precision on a device."""
         dtype = PRECISIONS[self.precision]
         return torch.autocast(device.type, dtype=dtype, enabled=dtype is not None)
 
@@ -152,20 +153,32 @@ class Renderer(nn.Module):
         check_positive("chunk", chunk)
         if not 0 <= time <= 1:
             raise ValueError(f"time must be in [0, 1], got {time}")
-        rays = camera.rays(time)
         modes = [(module, module.training) for module in self.modules()]
         self.eval()
         try:
-            parts = list(self._in_chunks(rays, self.field.at_time(time), chunk))
+            seen = self.sampler.seen_pixels(camera, time)
+            parts = list(self._in_chunks(camera.rays(time, seen), self.field.at_time(time), chunk))
+            columns = [torch.cat([p.rgb, p.opacity[:, None], p.depth[:, None]], dim=-1) for p in parts]
+            if seen is None:
+                picture = torch.cat(columns)
+            else:
+                picture = self._empty(camera, time)
+                for pixels, column in zip(seen.split([len(c) for c in columns]), columns, strict=True):
+                    picture[pixels] = column
         finally:
             for module, mode in modes:
                 module.training = mode
-        shape = (camera.intrinsics.height, camera.intrinsics.width)
-        return Rendering(
-            rgb=torch.cat([p.rgb for p in parts]).reshape(*shape, 3),
-            opacity=torch.cat([p.opacity for p in parts]).reshape(shape),
-            depth=torch.cat([p.depth for p in parts]).reshape(shape),
-        )
+        picture = picture.reshape(camera.intrinsics.height, camera.intrinsics.width, 5)
+        return Rendering(rgb=picture[..., :3], opacity=picture[..., 3], depth=picture[..., 4])
+
+    def _empty(self, camera: Camera, time: float) -> Tensor:
+        """A picture (P, 5) of nothing: the background, no opacity, no depth."""
+        if isinstance(self.background, ConstantBackground):
+            size = camera.intrinsics.width * camera.intrinsics.height
+            color = self.background(camera.pose.new_zeros(1, 3)).expand(size, 3)
+        else:
+            color = self.background(camera.rays(time).directions)
+        return torch.nn.functional.pad(color, (0, 2))
 
     def _in_chunks(self, rays: Rays, field: RadianceField, chunk: int) -> Iterator[Rendering]:
         """Render so many rays at a time; half as many from where a GPU's memory does not suffice."""

@@ -7,10 +7,12 @@ import torch
 from reference import fog
 from torch import Tensor
 
-from dnerf.compositing import Rendering
-from dnerf.losses import OpacityEntropyLoss, PhotometricLoss
+from dnerf.compositing import FieldOutput, Rendering
+from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
+from dnerf.fields import DeformedField, GridField, RadianceField
+from dnerf.losses import HiddenMatterLoss, OpacityEntropyLoss, PhotometricLoss
 from dnerf.renderer import Renderer
-from dnerf.samplers import StratifiedSampler
+from dnerf.samplers import OccupancySampler, StratifiedSampler
 
 RENDERER = Renderer(fog(), StratifiedSampler(4))
 
@@ -80,3 +82,127 @@ def test_bad_photometric_loss_is_refused(arguments: dict, message: str) -> None:
 def test_negative_entropy_weight_is_refused() -> None:
     with pytest.raises(ValueError, match="weight must be >= 0"):
         OpacityEntropyLoss(-1e-3)
+
+
+class Level(RadianceField):
+    """Fog whose density is a parameter."""
+
+    def __init__(self, density: float) -> None:
+        super().__init__()
+        self.level = torch.nn.Parameter(torch.tensor(density))
+        self.asked: list[tuple[Tensor, Tensor]] = []
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        self.asked.append((positions, times))
+        return self.level.expand(times.shape)
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        return FieldOutput(self.density(positions, times), torch.zeros_like(positions))
+
+
+class Shift(Deformation):
+    """Everything moves by half a unit along x."""
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        return positions + torch.tensor([0.5, 0.0, 0.0])
+
+
+BOX = [[-1.0] * 3, [1.0] * 3]
+
+
+def guided(density: float = 30.0, deformation: Deformation | None = None) -> Renderer:
+    sampler = OccupancySampler(BOX, 0.02, 8, num_slabs=2)
+    return Renderer(DeformedField(deformation or IdentityDeformation(), Level(density)), sampler)
+
+
+def seen_at(positions: Tensor, weights: Tensor) -> Rendering:
+    """A picture of samples at canonical positions with shares in it."""
+    output = FieldOutput(weights, torch.zeros(len(weights), 3), {"canonical_positions": positions})
+    return Rendering(torch.zeros(1, 3), torch.zeros(1), torch.zeros(1), weights=weights, output=output)
+
+
+NOTHING = seen_at(torch.zeros(0, 3), torch.zeros(0))
+TARGET = torch.zeros(1, 3)
+
+
+def test_hidden_matter_costs_the_opacity_of_an_interval() -> None:
+    loss = HiddenMatterLoss(BOX, 0.5, 100, length=0.1)(NOTHING, TARGET, guided(30.0))
+    assert loss.item() == pytest.approx(0.5 * -math.expm1(-3.0), rel=1e-6)
+
+
+def test_hidden_matter_is_pushed_out_unless_it_is_opaque() -> None:
+    for density, expected in ((0.0, 0.1), (30.0, 0.1 * math.exp(-3.0)), (1e4, 0.0)):
+        renderer = guided(density)
+        HiddenMatterLoss(BOX, 1.0, length=0.1)(NOTHING, TARGET, renderer).backward()
+        assert renderer.field.canonical.level.grad.item() == pytest.approx(expected, rel=1e-5, abs=1e-12)
+
+
+def test_what_is_seen_in_canonical_space_costs_nothing_until_it_is_forgotten() -> None:
+    """Half of canonical space is seen once, through a deformation that shifts by a quarter of the box."""
+    centers = torch.cartesian_prod(*[torch.arange(-0.75, 1.0, 0.5)] * 3)
+    half = centers[centers[:, 0] > 0]
+    renderer = guided(30.0, Shift())
+    loss = HiddenMatterLoss(BOX, 1.0, 4000, length=0.1, resolution=4, memory=3)
+    opacity = -math.expm1(-3.0)
+    # World x in [-1, 1] is canonical [-0.5, 1.5]; above 0 is three quarters, and what is beyond counts as at the face.
+    for expected in (0.25, 0.25, 0.25, 0.25, 1.0):
+        picture = seen_at(half, torch.full((len(half),), 0.5)) if loss.num_calls == 0 else NOTHING
+        assert loss(picture, TARGET, renderer).item() == pytest.approx(expected * opacity, rel=0.1)
+
+
+def test_a_share_too_small_to_see_does_not_count_as_seen() -> None:
+    centers = torch.cartesian_prod(*[torch.arange(-0.75, 1.0, 0.5)] * 3)
+    loss = HiddenMatterLoss(BOX, 1.0, resolution=4, length=0.1)
+    value = loss(seen_at(centers, torch.full((64,), 1e-4)), TARGET, guided(30.0))
+    assert value.item() == pytest.approx(-math.expm1(-3.0), rel=1e-6)
+    assert loss(seen_at(centers, torch.full((64,), 1e-2)), TARGET, guided(30.0)) == 0
+
+
+def test_no_gradient_of_hidden_matter_reaches_the_deformation() -> None:
+    deformation = DisplacementDeformation(1, 8, ())
+    torch.nn.init.normal_(deformation.mlp.output.weight)
+    renderer = Renderer(DeformedField(deformation, GridField(BOX, [4, 8])), OccupancySampler(BOX, 0.02, 8))
+    HiddenMatterLoss(BOX)(NOTHING, TARGET, renderer).backward()
+    assert all(p.grad is None for p in deformation.parameters())
+    assert renderer.field.canonical.table.grad.abs().sum() > 0
+
+
+def test_hidden_matter_is_looked_for_in_occupied_cells_and_elsewhere_each_time() -> None:
+    renderer = guided()
+    mask = torch.zeros_like(renderer.sampler.occupied)
+    mask[1, 2, 3, 4] = True
+    renderer.sampler.occupy(mask)
+    loss = HiddenMatterLoss(BOX)
+    loss(NOTHING, TARGET, renderer)
+    again = HiddenMatterLoss(BOX)
+    again.load_state_dict(loss.state_dict())
+    for each in (loss, again):
+        each(NOTHING, TARGET, renderer)
+    asked = renderer.field.canonical.asked
+    lowest = torch.tensor([-0.5, -0.25, 0.0])
+    for positions, times in asked:
+        assert positions.shape == (1024, 3)
+        assert ((positions >= lowest) & (positions <= lowest + 0.25)).all()
+        assert ((times >= 0.5) & (times <= 1)).all()
+    assert not torch.equal(asked[0][0], asked[1][0])
+    assert torch.equal(asked[1][0], asked[2][0])
+
+
+def test_hidden_matter_costs_nothing_where_nobody_knows_of_any() -> None:
+    renderer = guided()
+    assert HiddenMatterLoss(BOX)(NOTHING, TARGET, Renderer(renderer.field, StratifiedSampler(4))) == 0
+    renderer.sampler.occupy(torch.zeros_like(renderer.sampler.occupied))
+    assert HiddenMatterLoss(BOX)(NOTHING, TARGET, renderer) == 0
+
+
+@pytest.mark.parametrize(
+    "setting", [{"weight": -1.0}, {"num_points": 0}, {"length": 0.0}, {"resolution": 0}, {"memory": 0}]
+)
+def test_bad_settings_of_hidden_matter_are_named(setting: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        HiddenMatterLoss(BOX, **setting)
+
+
+def test_hidden_matter_wants_a_deformed_field() -> None:
+    with pytest.raises(ValueError, match="HiddenMatterLoss needs a deformed field, got FormulaField"):
+        HiddenMatterLoss(BOX)(NOTHING, TARGET, RENDERER)

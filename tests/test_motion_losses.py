@@ -6,21 +6,30 @@ from torch import Tensor
 
 from dnerf.benchmarks.closed_flows import Expansion, Rotation, Shear
 from dnerf.compositing import FieldOutput, Rendering
-from dnerf.deformations import DisplacementDeformation, FlowDeformation, LatticeFlow
+from dnerf.deformations import Deformation, DisplacementDeformation, FlowDeformation, LatticeFlow
 from dnerf.deformations.velocities import NetworkVelocity, Velocity
 from dnerf.fields import DeformedField
-from dnerf.motion_losses import AccelerationLoss, CycleConsistencyLoss, DivergenceLoss, SmoothVelocityLoss
+from dnerf.motion_losses import (
+    AccelerationLoss,
+    CycleConsistencyLoss,
+    DivergenceLoss,
+    ElasticLoss,
+    SmoothVelocityLoss,
+    spread_directions,
+)
 from dnerf.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
 
 LOSSES = {
+    "elastic": ElasticLoss,
     "smooth": SmoothVelocityLoss,
     "divergence": DivergenceLoss,
     "acceleration": AccelerationLoss,
     "cycle": CycleConsistencyLoss,
 }
 every_loss = pytest.mark.parametrize("name", LOSSES)
+every_loss_of_flows = pytest.mark.parametrize("name", [name for name in LOSSES if name != "elastic"])
 
 
 def renderer_of(velocity: Velocity, **settings: object) -> Renderer:
@@ -47,6 +56,66 @@ def test_smoothness_of_linear_fields_is_the_norm_of_their_matrix() -> None:
 def test_divergence_of_linear_fields_is_their_trace() -> None:
     assert value(DivergenceLoss(1.0), Expansion(1.5)) == pytest.approx((3 * 1.5) ** 2, rel=1e-5)
     assert value(DivergenceLoss(1.0), Rotation(2.0)) < 1e-9
+
+
+class Linear(Deformation):
+    """x -> A x, the same at all times."""
+
+    def __init__(self, matrix: Tensor) -> None:
+        super().__init__()
+        self.matrix = torch.nn.Parameter(matrix)
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        return positions @ self.matrix.to(positions.dtype).mT
+
+
+def elastic(matrix: Tensor, count: int = 4000, weight: float = 1.0) -> Tensor:
+    renderer = Renderer(DeformedField(Linear(matrix), make_scene("static")), StratifiedSampler(4))
+    return ElasticLoss(weight, count)(rendering(count), torch.zeros(8, 3), renderer)
+
+
+def test_rigid_motion_is_not_elastic() -> None:
+    rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+    # The floor under the stretch, LEAST_STRETCH^2 = 1e-4 of its square, is all that is left: (1e-4 / 2)^2.
+    assert elastic(rotation).item() <= 2.6e-9
+
+
+def test_even_stretch_costs_the_square_of_its_logarithm() -> None:
+    for factor in (0.5, 3.0):
+        expected = 0.5 * torch.log(torch.tensor(factor)).square()
+        assert elastic(factor * torch.eye(3), weight=0.5).item() == pytest.approx(expected.item(), rel=1e-3)
+
+
+def test_uneven_stretch_costs_the_mean_over_all_directions() -> None:
+    """Against the mean over many random directions on the sphere."""
+    matrix = torch.tensor([[1.5, 0.2, 0.0], [0.0, 0.6, 0.1], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(200_000, 3, dtype=torch.float64), dim=-1)
+    expected = torch.log((directions @ matrix.mT).norm(dim=-1)).square().mean().item()
+    assert elastic(matrix).item() == pytest.approx(expected, rel=0.05)  # shares of 4000 points are random
+
+
+def test_collapse_costs_much_and_is_pushed_open() -> None:
+    deformation = Linear(torch.diag(torch.tensor([1.0, 1.0, 0.05], dtype=torch.float64)))
+    renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
+    loss = ElasticLoss(1.0)(rendering(), torch.zeros(8, 3), renderer)
+    loss.backward()
+    assert loss.item() > 0.1
+    assert deformation.matrix.grad[2, 2] < -0.1  # a step against the gradient makes it thicker
+
+
+def test_gradient_is_finite_where_all_is_collapsed() -> None:
+    deformation = Linear(torch.zeros(3, 3))
+    renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
+    ElasticLoss(1.0)(rendering(dtype=torch.float32), torch.zeros(8, 3), renderer).backward()
+    assert torch.isfinite(deformation.matrix.grad).all()
+
+
+def test_directions_are_spread_evenly() -> None:
+    directions = spread_directions(torch.zeros(1000, 3, dtype=torch.float64))
+    assert (directions.norm(dim=-1) - 1).abs().max() < 1e-12
+    assert (directions.mean(0)).abs().max() < 2e-3
+    assert (directions.mT @ directions / 1000 - torch.eye(3) / 3).abs().max() < 2e-3
+    assert spread_directions(torch.zeros(0, 3)).shape == (0, 3)
 
 
 def test_acceleration_of_a_rotation_is_centripetal() -> None:
@@ -91,7 +160,7 @@ def test_gradients_reach_the_velocity(name: str) -> None:
     assert torch.count_nonzero(velocity.from_positions.weight.grad) > 0
 
 
-@every_loss
+@every_loss_of_flows
 def test_a_flow_on_a_lattice_is_judged_by_its_flow(name: str) -> None:
     renderer = renderer_of(Expansion(0.5), solver="euler", num_steps=4)
     plain = LOSSES[name](1.0)
@@ -118,16 +187,22 @@ def test_an_empty_picture_costs_nothing(name: str) -> None:
     assert loss == 0
 
 
-@every_loss
+@every_loss_of_flows
 def test_a_deformation_that_is_no_flow_is_named(name: str) -> None:
     field = DeformedField(DisplacementDeformation(1, 4, ()), make_scene("static"))
     with pytest.raises(ValueError, match="needs a renderer whose deformation is a flow, got DisplacementDeformation"):
         LOSSES[name](1.0)(rendering(), torch.zeros(8, 3), Renderer(field, StratifiedSampler(4)))
 
 
+def test_a_field_without_deformation_is_named() -> None:
+    with pytest.raises(ValueError, match="ElasticLoss needs a deformed field, got "):
+        ElasticLoss()(rendering(), torch.zeros(8, 3), Renderer(make_scene("static"), StratifiedSampler(4)))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: ElasticLoss(distance=0.0), "distance must be > 0"),
         (lambda: SmoothVelocityLoss(-1.0), "weight must be >= 0"),
         (lambda: DivergenceLoss(1.0, 0), "num_points must be > 0"),
         (lambda: AccelerationLoss(interval=0.6), r"interval must be in \(0, 0\.5\]"),

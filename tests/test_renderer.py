@@ -7,7 +7,7 @@ import torch
 from reference import composite_ray, fog, rays_towards_origin, soft_ball
 from torch import Tensor, nn
 
-from dnerf.backgrounds import ConstantBackground, RandomBackground
+from dnerf.backgrounds import Background, ConstantBackground, RandomBackground
 from dnerf.cameras import Camera, Intrinsics, look_at
 from dnerf.compositing import FieldOutput, Rendering, composite
 from dnerf.deformations import DisplacementDeformation
@@ -32,6 +32,13 @@ def trained_field() -> RadianceField:
 
 def some_camera(width: int = 7, height: int = 5) -> Camera:
     return Camera(Intrinsics.from_angle(width, height, 0.7), look_at((2, 2, 1.5)), 1.0, 5.0)
+
+
+class Sky(Background):
+    """A colour for each direction."""
+
+    def forward(self, directions: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+        return 0.5 + 0.5 * directions
 
 
 SAMPLERS = {"stratified": lambda: StratifiedSampler(16), "importance": lambda: ImportanceSampler(12, 12, soft_ball())}
@@ -299,3 +306,19 @@ def test_quadrature_is_that_of_the_compositor() -> None:
     assert (pictures["constant"] - pictures["parabolic"]).abs().max() > 1e-4
     with pytest.raises(ValueError, match="quadrature must be one of"):
         Renderer(soft_ball(), StratifiedSampler(12), quadrature="cubic")
+
+
+@pytest.mark.parametrize("background", [ConstantBackground("white"), RandomBackground("black"), Sky()])
+@pytest.mark.parametrize("share", [0.0, 0.02])
+def test_a_picture_of_pixels_that_may_see_something_is_that_of_all(background: nn.Module, share: float) -> None:
+    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.05, 16, num_slabs=4, pad_to=1)
+    sampler.occupy(torch.rand(sampler.occupied.shape, generator=seeded(0)) < share)
+    renderer = Renderer(trained_field(), sampler, background, stop_transmittance=1e-3)
+    camera = some_camera(40, 30)
+    quick = renderer.render_image(camera, 0.6, chunk=100)
+    assert len(sampler.seen_pixels(camera, 0.6)) < 40 * 30
+    sampler.seen_pixels = lambda camera, time: None
+    whole = renderer.render_image(camera, 0.6, chunk=100)
+    for name in ("rgb", "opacity", "depth"):
+        torch.testing.assert_close(getattr(quick, name), getattr(whole, name), rtol=0, atol=2e-6)
+    assert bool(whole.opacity.any()) == bool(share)

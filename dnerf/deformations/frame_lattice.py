@@ -60,6 +60,7 @@ class FrozenDeformation(Deformation):
         self.low, self.sides = lattice.box[0], lattice.box[1] - lattice.box[0]
         self.displacements = torch.zeros(num_vertices, 4)  # four, so that rows are aligned
         self.is_known = torch.zeros([c + 1 for c in reversed(lattice.cells)], dtype=torch.bool)
+        self.is_filled = torch.zeros(list(reversed(lattice.cells)), dtype=torch.bool)  # cells with known vertices
 
     @torch.no_grad()
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
@@ -89,17 +90,21 @@ class FrozenDeformation(Deformation):
         if self.displacements.device != device:
             self.low, self.sides = self.low.to(device), self.sides.to(device)
             self.displacements, self.is_known = self.displacements.to(device), self.is_known.to(device)
+            self.is_filled = self.is_filled.to(device)
 
     def _fill(self, unit: Tensor) -> None:
         """Ask the deformation at the vertices of the points' cells that are not known yet."""
         size = torch.tensor(self.levels.cells, device=unit.device)
-        lower = (unit.clamp(0, 1) * size.to(unit.dtype)).long().clamp(max=size - 1)
-        needed = torch.zeros_like(self.is_known)
-        needed[lower[:, 2], lower[:, 1], lower[:, 0]] = True
+        x, y, z = (unit.clamp(0, 1) * size.to(unit.dtype)).long().clamp(max=size - 1).unbind(-1)
+        cells = (z * self.is_filled.shape[1] + y) * self.is_filled.shape[2] + x
+        new = cells[~self.is_filled.view(-1)[cells]]
+        if not len(new):
+            return
+        self.is_filled.view(-1)[new] = True
+        needed = torch.nn.functional.pad(self.is_filled, (0, 1) * 3)
         for axis in range(3):
-            moved = needed.clone()
-            moved.narrow(axis, 1, needed.shape[axis] - 1).logical_or_(needed.narrow(axis, 0, needed.shape[axis] - 1))
-            needed = moved
+            length = needed.shape[axis] - 1
+            needed.narrow(axis, 1, length).logical_or_(needed.narrow(axis, 0, length).clone())
         places = (needed & ~self.is_known).nonzero()
         if not len(places):
             return

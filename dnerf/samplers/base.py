@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
+from dnerf.cameras import Camera
 from dnerf.fields.base import RadianceField
 from dnerf.rays import Rays, Samples
 
@@ -24,6 +25,30 @@ class Sampler(nn.Module, ABC):
             field: the field that will be rendered; samplers that look where matter is ask it.
             generator: source of randomness in training mode.
         """
+
+    def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
+        """Pixels of a view in whose rays this sampler may place samples in evaluation mode; all unless overridden.
+
+        Args:
+            camera: the view, on the sampler's device.
+            time: of the frame, in [0, 1].
+
+        Returns:
+            Their numbers (P,) int64, `row * width + column`, in order; None for all.
+        """
+        return None
+
+    def places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
+        """Random places where matter may be, evenly spread over all of them; None if this sampler does not know.
+
+        Args:
+            count: of places.
+            generator: of the randomness, on the sampler's device.
+
+        Returns:
+            positions (count, 3) in world units and times (count,) in [0, 1].
+        """
+        return None
 
     def update(self, field: RadianceField, step: int) -> None:
         """Learn from the field between training steps; does nothing unless overridden.

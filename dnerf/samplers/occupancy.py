@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from dnerf.cameras import Camera
 from dnerf.checks import as_box, check_positive
 from dnerf.fields.base import RadianceField
 from dnerf.kernels import march, skip_distances
@@ -122,7 +123,7 @@ class OccupancySampler(Sampler):
         has_own = render_margin != margin
         self.register_buffer("rendered", self.occupied.clone() if has_own else None)
         self.register_buffer("rendered_skips", self.skips.clone() if has_own else None, persistent=False)
-        self.register_load_state_dict_post_hook(_find_skips)
+        self.register_load_state_dict_post_hook(_derive)
         self.box: Tensor
         self.shape: Tensor
         self.strides: Tensor
@@ -131,6 +132,7 @@ class OccupancySampler(Sampler):
         self.occupied: Tensor
         self.rendered: Tensor | None
         self.rendered_skips: Tensor | None
+        self._cells: Tensor | None = None  # numbers of the occupied ones, once asked for
 
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Packed samples; intervals begin at random offsets in training, at multiples of the step in evaluation."""
@@ -163,6 +165,31 @@ class OccupancySampler(Sampler):
         """Shorten the intervals of training to where it stands, `progress` in [0, 1]."""
         part = min(progress / self.coarse_until, 1.0)
         self.training_step = self.coarse_step * (self.step_size / self.coarse_step) ** part
+
+    @torch.no_grad()
+    def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
+        """Pixels inside the rectangles that occupied cells cover on the picture; all if a cell lies beside the camera.
+
+        So a frame costs what the body covers, not what the picture holds. No pixel is lost: cells are convex, so the
+        rectangle around a cell's corners holds all of it.
+        """
+        occupied = self.occupied if self.rendered is None else self.rendered
+        num_slabs = len(occupied)
+        slab = int(torch.tensor(time, dtype=torch.float32) * num_slabs)  # rounds as times of rays do
+        lowest = occupied[min(slab, num_slabs - 1)].nonzero()
+        unit = (lowest[:, None] + _corners(lowest.device)) / self.shape[1:]
+        return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
+
+    @torch.no_grad()
+    def places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
+        """Random positions and times in occupied cells, or None if no cell is occupied."""
+        if self._cells is None or self._cells.device != self.occupied.device:
+            self._cells = self.occupied.view(-1).nonzero()[:, 0]
+        if not len(self._cells):
+            return None
+        device = self._cells.device
+        chosen = torch.randint(len(self._cells), (count,), generator=generator, device=device)
+        return self._within(self._cells[chosen], torch.rand(count, 4, generator=generator, device=device))
 
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
         asked, number = joined(samples, self.filter_joins)
@@ -225,10 +252,13 @@ class OccupancySampler(Sampler):
         self._decide(is_filled=True)
 
     def _probe(self, field: RadianceField, cells: Tensor, within: Tensor) -> None:
-        unit = (torch.stack(torch.unravel_index(cells, self.maxima.shape), dim=-1) + within) / self.shape
-        positions = torch.lerp(self.box[0], self.box[1], unit[:, 1:])
-        density = field.density(positions, unit[:, 0])
+        density = field.density(*self._within(cells, within))
         self.maxima.view(-1).scatter_reduce_(0, cells, density.to(self.maxima.dtype), "amax")
+
+    def _within(self, cells: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (N, 3) and times (N,) at places (N, 4) in [0, 1] within cells (N,)."""
+        unit = (torch.stack(torch.unravel_index(cells, self.maxima.shape), dim=-1) + within) / self.shape
+        return torch.lerp(self.box[0], self.box[1], unit[:, 1:]), unit[:, 0]
 
     def _decide(self, *, is_filled: bool = False) -> None:
         threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
@@ -252,12 +282,18 @@ class OccupancySampler(Sampler):
         self.occupied.copy_(occupied)
         if self.rendered is not None:
             self.rendered.copy_(rendered)
-        _find_skips(self)
+        _derive(self)
 
 
-def _find_skips(sampler: nn.Module, incompatible_keys: object = None) -> None:
-    """Derive a sampler's skips, which are not saved."""
+def _corners(device: torch.device) -> Tensor:
+    """The corners (8, 3) of the unit cube."""
+    return torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
+
+
+def _derive(sampler: nn.Module, incompatible_keys: object = None) -> None:
+    """Derive what is not saved from the occupied cells: a sampler's skips; their list on demand."""
     assert isinstance(sampler, OccupancySampler)
+    sampler._cells = None
     sampler.skips.copy_(skip_distances(sampler.occupied))
     if sampler.rendered is not None and sampler.rendered_skips is not None:
         sampler.rendered_skips.copy_(skip_distances(sampler.rendered))

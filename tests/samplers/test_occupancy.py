@@ -7,6 +7,7 @@ import torch
 from reference import FormulaField, fog, rays_towards_origin
 from torch import Tensor
 
+from dnerf.cameras import Camera, Intrinsics, look_at
 from dnerf.compositing import FieldOutput, composite
 from dnerf.fields import RadianceField
 from dnerf.kernels import skip_distances
@@ -238,3 +239,54 @@ def test_nothing_is_not_padded() -> None:
     sampler.occupied.fill_(False)
     sampler.skips.copy_(skip_distances(sampler.occupied))
     assert sampler.eval()(rays_towards_origin(5), MovingBall()).starts.shape == (0,)
+
+
+def camera_at(eye: tuple[float, float, float], pixel_origin: str = "center") -> Camera:
+    return Camera(Intrinsics.from_angle(33, 21, 0.6, pixel_origin), look_at(eye), 0.5, 6.0)
+
+
+@pytest.mark.parametrize("pixel_origin", ["center", "corner"])
+@pytest.mark.parametrize("density", [0.0, 0.002, 0.05])
+def test_no_pixel_is_lost_that_has_samples(density: float, pixel_origin: str) -> None:
+    """Random cells, random views: what `seen_pixels` leaves out marches through nothing."""
+    sampler = small(margin=1, render_margin=0).eval()
+    left_out = 0
+    for seed in range(20):
+        generator = torch.Generator().manual_seed(seed)
+        sampler.occupy(torch.rand(sampler.occupied.shape, generator=generator) < density)
+        eye, time = torch.randn(3, generator=generator), float(torch.rand((), generator=generator))
+        camera = camera_at(tuple((3 * eye / eye.norm()).tolist()), pixel_origin)
+        seen = sampler.seen_pixels(camera, time)
+        assert seen is not None
+        assert torch.equal(seen, seen.unique())
+        hit = sampler(camera.rays(time), fog(1.0)).ray_indices.unique()
+        assert torch.isin(hit, seen).all()
+        left_out += camera.intrinsics.width * camera.intrinsics.height - len(seen)
+    assert left_out > 0
+
+
+def test_one_cell_is_seen_through_its_own_rectangle_only() -> None:
+    sampler = small(margin=0, render_margin=0).eval()
+    mask = torch.zeros_like(sampler.occupied)
+    mask[:, 8, 8, 8] = True
+    sampler.occupy(mask)
+    camera = camera_at((3.0, 0.0, 0.0))
+    seen = sampler.seen_pixels(camera, 0.3)
+    corners = torch.cartesian_prod(*[torch.tensor([0.0, 0.125])] * 3)
+    columns, rows = camera.project(corners)[0].unbind(-1)
+    assert seen.remainder(33).min() >= columns.min() - 1
+    assert seen.remainder(33).max() <= columns.max() + 1
+    assert seen.div(33, rounding_mode="floor").min() >= rows.min() - 1
+    assert seen.div(33, rounding_mode="floor").max() <= rows.max() + 1
+
+
+def test_all_pixels_are_seen_from_within_the_grid() -> None:
+    sampler = small().eval()
+    assert sampler.seen_pixels(camera_at((0.2, 0.1, 0.3)), 0.5) is None
+
+
+def test_the_grid_of_evaluation_decides_what_is_seen() -> None:
+    sampler = small(margin=1, render_margin=0, num_slabs=2).eval()
+    sampler.occupied.fill_(True)
+    sampler.rendered.fill_(False)
+    assert len(sampler.seen_pixels(camera_at((3.0, 0.0, 0.0)), 0.5)) == 0
