@@ -15,6 +15,7 @@ from dnerf.samplers.visibility import joined, visible_samples
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
+SPACE = (1, 2, 3)  # axes
 NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no picture shows
 
 
@@ -43,14 +44,16 @@ class OccupancySampler(Sampler):
         decay: factor on all maxima at each update.
         update_every: training steps between updates.
         num_probes: random cells asked at each update.
-        margin: cells by which occupied regions are widened in space (0 or 1); time is widened by one slab.
+        margin: cells by which occupied regions are widened in space (0 or 1); time is widened by one slab, and in
+            evaluation, if `render_margin` differs, by the nearer half of one.
         render_margin: the same in evaluation mode. Training needs the margin, for matter to move into; pictures of a
             trained field hardly do, and it is half of their samples. `fill` always takes `margin`.
         min_weight: in training, the field is first asked for densities without gradients, front to back, and only
             samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. (Pictures without
             gradients end rays early instead: `Renderer.stop_transmittance`.)
         filter_joins: the filter of `min_weight` asks once for so many neighbouring intervals, and keeps all or none.
-        pad_to: the number of samples is rounded up to a multiple of this, see `Samples.padded` (1 for no padding).
+        pad_to: in training the number of samples is rounded up to a multiple of this, see `Samples.padded` (1 for no
+            padding).
 
     Raises:
         ValueError: for numbers out of range.
@@ -121,8 +124,10 @@ class OccupancySampler(Sampler):
         self.register_buffer("occupied", torch.ones((num_slabs, *cells), dtype=torch.bool))
         self.register_buffer("skips", skip_distances(self.occupied), persistent=False)
         has_own = render_margin != margin
-        self.register_buffer("rendered", self.occupied.clone() if has_own else None)
-        self.register_buffer("rendered_skips", self.skips.clone() if has_own else None, persistent=False)
+        # Two for each slab: the earlier half is widened by the slab before, the later one by the slab after.
+        halves = torch.ones((2 * num_slabs, *cells), dtype=torch.bool) if has_own else None
+        self.register_buffer("rendered", halves)
+        self.register_buffer("rendered_skips", None if halves is None else skip_distances(halves), persistent=False)
         self.register_load_state_dict_post_hook(_derive)
         self.box: Tensor
         self.shape: Tensor
@@ -159,7 +164,7 @@ class OccupancySampler(Sampler):
         )
         if self.training and self.min_weight > 0:
             samples = self._visible(samples, rays, field)
-        return samples.padded(self.pad_to)
+        return samples.padded(self.pad_to) if self.training else samples
 
     def set_progress(self, progress: float) -> None:
         """Shorten the intervals of training to where it stands, `progress` in [0, 1]."""
@@ -262,12 +267,12 @@ class OccupancySampler(Sampler):
 
     def _decide(self, *, is_filled: bool = False) -> None:
         threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
-        tight = _widened(self.maxima > threshold, 0)
-        wide = tight
-        for axis in range(1, 4):
-            wide = _widened(wide, axis)
-        margins = (tight, wide)
-        self._set(margins[self.margin], margins[self.margin if is_filled else self.render_margin])
+        dense = self.maxima > threshold
+        occupied = _widened(_widened(dense, [0]), SPACE if self.margin else [])
+        if is_filled or self.rendered is None:
+            self._set(occupied, occupied.repeat_interleave(2, dim=0))
+        else:
+            self._set(occupied, _widened(_halves(dense), SPACE if self.render_margin else []))
 
     @torch.no_grad()
     def occupy(self, mask: Tensor) -> None:
@@ -276,7 +281,8 @@ class OccupancySampler(Sampler):
         Args:
             mask: (K, Gx, Gy, Gz) bool, or what broadcasts to it.
         """
-        self._set(mask, mask)
+        mask = mask.expand(self.occupied.shape)
+        self._set(mask, mask.repeat_interleave(2, dim=0))
 
     def _set(self, occupied: Tensor, rendered: Tensor) -> None:
         self.occupied.copy_(occupied)
@@ -299,9 +305,17 @@ def _derive(sampler: nn.Module, incompatible_keys: object = None) -> None:
         sampler.rendered_skips.copy_(skip_distances(sampler.rendered))
 
 
-def _widened(mask: Tensor, axis: int) -> Tensor:
-    """A mask and its neighbours on both sides along one axis."""
-    result, size = mask.clone(), mask.shape[axis] - 1
-    result.narrow(axis, 1, size).logical_or_(mask.narrow(axis, 0, size))
-    result.narrow(axis, 0, size).logical_or_(mask.narrow(axis, 1, size))
-    return result
+def _widened(mask: Tensor, axes: Sequence[int]) -> Tensor:
+    """A mask and its neighbours on both sides along some axes."""
+    for axis in axes:
+        result, size = mask.clone(), mask.shape[axis] - 1
+        result.narrow(axis, 1, size).logical_or_(mask.narrow(axis, 0, size))
+        result.narrow(axis, 0, size).logical_or_(mask.narrow(axis, 1, size))
+        mask = result
+    return mask
+
+
+def _halves(mask: Tensor) -> Tensor:
+    """A mask (K, ...) for halves of its slabs (2 K, ...), each with the neighbour that is nearer in time."""
+    before, after = torch.cat([mask[:1], mask[:-1]]), torch.cat([mask[1:], mask[-1:]])
+    return torch.stack([mask | before, mask | after], dim=1).flatten(0, 1)
