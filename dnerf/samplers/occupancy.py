@@ -48,6 +48,8 @@ class OccupancySampler(Sampler):
             evaluation, if `render_margin` differs, by the nearer half of one.
         render_margin: the same in evaluation mode. Training needs the margin, for matter to move into; pictures of a
             trained field hardly do, and it is half of their samples. `fill` always takes `margin`.
+        narrow_from: fraction of training, in [0, 1], from which on training marches through what pictures do: once
+            shapes stand, most samples in the margin are asked for nothing. Probes still find what comes into being.
         min_weight: in training, the field is first asked for densities without gradients, front to back, and only
             samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. (Pictures without
             gradients end rays early instead: `Renderer.stop_transmittance`.)
@@ -76,6 +78,7 @@ class OccupancySampler(Sampler):
         num_probes: int = 1 << 16,
         margin: int = 1,
         render_margin: int = 1,
+        narrow_from: float = 1.0,
         min_weight: float = 0.0,
         filter_joins: int = 1,
         pad_to: int = 2048,
@@ -96,6 +99,8 @@ class OccupancySampler(Sampler):
             check_positive(name, value)
         if coarse_until > 1:
             raise ValueError(f"coarse_until must be in (0, 1], got {coarse_until}")
+        if not 0 <= narrow_from <= 1:
+            raise ValueError(f"narrow_from must be in [0, 1], got {narrow_from}")
         if not 0 < decay < 1:
             raise ValueError(f"decay must be in (0, 1), got {decay}")
         for name, value in (("margin", margin), ("render_margin", render_margin)):
@@ -108,6 +113,8 @@ class OccupancySampler(Sampler):
         self.coarse_step = step_size if coarse_step is None else coarse_step
         self.coarse_until = coarse_until
         self.training_step = self.coarse_step
+        self.narrow_from = narrow_from
+        self.is_narrow = False
         self.threshold = threshold
         self.decay = decay
         self.update_every = update_every
@@ -145,7 +152,7 @@ class OccupancySampler(Sampler):
         if self.training:
             jitter.uniform_(generator=generator)
         occupied, skips = self.occupied, self.skips
-        if not self.training and self.rendered is not None and self.rendered_skips is not None:
+        if (not self.training or self.is_narrow) and self.rendered is not None and self.rendered_skips is not None:
             occupied, skips = self.rendered, self.rendered_skips
         marched = march(
             rays.origins,
@@ -167,9 +174,10 @@ class OccupancySampler(Sampler):
         return samples.padded(self.pad_to) if self.training else samples
 
     def set_progress(self, progress: float) -> None:
-        """Shorten the intervals of training to where it stands, `progress` in [0, 1]."""
+        """Shorten the intervals of training and drop its margin as it goes on, `progress` in [0, 1]."""
         part = min(progress / self.coarse_until, 1.0)
         self.training_step = self.coarse_step * (self.step_size / self.coarse_step) ** part
+        self.is_narrow = progress >= self.narrow_from
 
     @torch.no_grad()
     def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:

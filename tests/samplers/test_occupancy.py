@@ -200,6 +200,7 @@ def test_grid_is_saved_with_the_model() -> None:
         ({"render_margin": 2}, "render_margin must be 0 or 1"),
         ({"coarse_step": 0.0}, "coarse_step must be > 0"),
         ({"coarse_until": 1.5}, r"coarse_until must be in \(0, 1\]"),
+        ({"narrow_from": 1.5}, r"narrow_from must be in \[0, 1\]"),
         ({"filter_joins": 0}, "filter_joins must be > 0"),
     ],
 )
@@ -241,6 +242,24 @@ def test_nothing_is_not_padded() -> None:
     sampler.occupied.fill_(False)
     sampler.skips.copy_(skip_distances(sampler.occupied))
     assert sampler(rays_towards_origin(5), MovingBall()).starts.shape == (0,)
+
+
+def test_training_drops_the_margin_when_told() -> None:
+    sampler = small(render_margin=0, narrow_from=0.3)
+    sampler.fill(MovingBall())
+    sampler._decide()
+    rays = rays_towards_origin(40)
+
+    def count() -> int:
+        return len(sampler(rays, MovingBall(), generator=torch.Generator().manual_seed(0)).starts)
+
+    sampler.train().set_progress(0.29)
+    wide = count()
+    sampler.set_progress(0.3)
+    narrow = count()
+    sampler.set_progress(0.29)
+    assert 0 < narrow < 0.8 * wide
+    assert count() == wide
 
 
 def camera_at(eye: tuple[float, float, float], pixel_origin: str = "center") -> Camera:
