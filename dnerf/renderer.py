@@ -100,8 +100,10 @@ class Renderer(nn.Module):
         """What `forward` shows of a field, without per-sample data: rays end where they are opaque."""
         with self.autocast(rays.origins.device):
             samples = self.sampler(rays, field)
-        if not samples.is_packed or self.stop_transmittance == 0 or self.quadrature != "constant":
+        if not samples.is_packed:
             return self._render(rays, samples, field)
+        if self.stop_transmittance == 0 or self.quadrature != "constant":
+            return self._render(rays, samples.padded(PAD_TO), field)
         sums = rays.origins.new_zeros(len(rays), 5)
 
         def visit(ray_numbers: Tensor, chosen: Tensor, part: Samples, transmittance: Tensor) -> Tensor:

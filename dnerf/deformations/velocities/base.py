@@ -55,6 +55,12 @@ class BoxWindow(nn.Module):
         """Factor (..., 1) at positions (..., 3)."""
         return self._steps(self._depth(positions)).prod(-1, keepdim=True)
 
+    def inside(self, positions: Tensor) -> Tensor:
+        """Positions (..., 3) moved into the box: where the factor is 0, fields are asked at its faces, so that no
+        product overflows for points however far."""
+        center, reach = self.center.to(positions.dtype), self.reach.to(positions.dtype)
+        return positions.clamp(center - reach, center + reach)
+
     def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Factor (..., 1) and its gradient (..., 3) to the position, differentiable both."""
         depth = self._depth(positions)

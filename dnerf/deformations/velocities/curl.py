@@ -59,7 +59,7 @@ class CurlVelocity(Velocity):
         amplitudes = self.amplitudes(self.encode_times(times[..., None])).to(positions.dtype)
         amplitudes = amplitudes.unflatten(-1, (-1, 3))
         # Elementwise sums rather than products of matrices, which autocast would run in bfloat16.
-        angles = (positions[..., None, :] * self.wavevectors).sum(-1) + self.phases
+        angles = (self.window.inside(positions)[..., None, :] * self.wavevectors).sum(-1) + self.phases
         turned = torch.linalg.cross(self.wavevectors.expand(amplitudes.shape), amplitudes)
         potential = (torch.sin(angles)[..., None] * amplitudes).sum(-2)
         curl = (torch.cos(angles)[..., None] * turned).sum(-2)

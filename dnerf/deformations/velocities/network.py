@@ -76,7 +76,8 @@ class NetworkVelocity(Velocity):
         of_times = self.from_times(self.encode_times(times[..., None]))
 
         def velocity(positions: Tensor) -> Tensor:
-            hidden = self.activation(self.from_positions(self.encode_positions(positions)) + of_times)
+            inside = self.window.inside(positions)
+            hidden = self.activation(self.from_positions(self.encode_positions(inside)) + of_times)
             return self.window(positions) * self.mlp(hidden).to(positions.dtype)
 
         return velocity

@@ -59,7 +59,7 @@ class RigidVelocity(Velocity):
         """Velocity (..., 3) at positions (..., 3) and times (...,)."""
         motions = self.motions(self.encode_times(times[..., None])).to(positions.dtype).unflatten(-1, (-1, 9))
         turning, travelling, shift = motions.split(3, dim=-1)
-        arms = positions[..., None, :] - (self.centers + shift)
+        arms = self.window.inside(positions)[..., None, :] - (self.centers + shift)
         shares = torch.softmax(-0.5 * arms.square().sum(-1) * torch.exp(-2 * self.log_radii), dim=-1)
         blended = (shares[..., None] * (torch.linalg.cross(turning, arms) + travelling)).sum(-2)
         return self.window(positions) * blended
