@@ -188,7 +188,7 @@ class OccupancySampler(Sampler):
         """
         occupied = self.occupied if self.rendered is None else self.rendered
         num_slabs = len(occupied)
-        slab = int(torch.tensor(time, dtype=torch.float32) * num_slabs)  # rounds as times of rays do
+        slab = int(torch.tensor(time, dtype=camera.pose.dtype) * num_slabs)  # rounds as times of rays do
         lowest = occupied[min(slab, num_slabs - 1)].nonzero()
         unit = (lowest[:, None] + _corners(lowest.device)) / self.shape[1:]
         return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
