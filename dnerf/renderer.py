@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import chain
 
 import torch
@@ -15,11 +16,12 @@ from dnerf.fields.base import RadianceField
 from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
-from dnerf.samplers.visibility import walk_front_to_back
+from dnerf.samplers.visibility import PackedRounds, Source, walk_front_to_back
 
 logger = logging.getLogger(__name__)
 
 PAD_TO = 2048  # samples; see `Samples.padded`
+FRAMES_THAT_SHARE = 16  # from so many on a sequence has gained what keeping things between its frames costs
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
 
 
@@ -98,15 +100,19 @@ class Renderer(nn.Module):
 
     def _without_gradients(self, rays: Rays, field: RadianceField) -> Rendering:
         """What `forward` shows of a field, without per-sample data: rays end where they are opaque."""
-        with self.autocast(rays.origins.device):
-            samples = self.sampler(rays, field)
-        if not samples.is_packed:
-            return self._render(rays, samples, field)
-        if self.stop_transmittance == 0 or self.quadrature != "constant":
-            return self._render(rays, samples.padded(PAD_TO), field)
+        ends_early = self.stop_transmittance > 0 and self.quadrature == "constant"
+        source = self._marched(rays) if ends_early else None
+        if source is None:
+            with self.autocast(rays.origins.device):
+                samples = self.sampler(rays, field)
+            if not samples.is_packed:
+                return self._render(rays, samples, field)
+            if not ends_early:
+                return self._render(rays, samples.padded(PAD_TO), field)
+            source = PackedRounds(samples, PAD_TO)
         sums = rays.origins.new_zeros(len(rays), 5)
 
-        def visit(ray_numbers: Tensor, chosen: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
+        def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
             with self.autocast(rays.origins.device):
                 output = field(*part.locate(rays[ray_numbers]))
             seen = composite(part, output)
@@ -114,10 +120,23 @@ class Renderer(nn.Module):
             sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))
             return 1 - seen.opacity
 
-        walk_front_to_back(samples, self.stop_transmittance, visit, pad_to=PAD_TO)
+        walk_front_to_back(source, rays.near.new_ones(len(rays)), self.stop_transmittance, visit)
         rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
         rgb = rgb + (1 - opacity)[:, None] * self.background(rays.directions)
         return Rendering(rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity))
+
+    def _marched(self, rays: Rays) -> Source | None:
+        """Samples that are looked for only when light still gets there; None if the sampler places all at once."""
+        begins = rays.near.clone()
+
+        def source(numbers: Tensor, taken: int, size: int) -> tuple[Samples, Tensor]:
+            part = self.sampler.first(replace(rays[numbers], near=begins[numbers]), size)
+            assert part is not None
+            is_full = part.offsets.diff() == size
+            begins[numbers[is_full]] = part.ends[part.offsets[1:][is_full] - 1]
+            return part.padded(PAD_TO), is_full
+
+        return None if self.sampler.first(rays[:0], 1) is None else source
 
     def update(self, step: int) -> None:
         """Let the sampler learn from the field, between training steps; `step` counts those done."""
@@ -135,6 +154,24 @@ class Renderer(nn.Module):
             listener = getattr(module, "set_progress", None)
             if module is not self and callable(listener):
                 listener(progress)
+
+    def for_sequence(self, num_frames: int) -> "Renderer":
+        """A renderer of the same finished model for so many frames; this one, unless sharing work between them pays.
+
+        What the frames share is computed as they come and kept (`RadianceField.finished`), so it knows nothing of later
+        changes of the field. Sampler and background are this renderer's own.
+        """
+        field = self.field if num_frames < FRAMES_THAT_SHARE else self.field.finished()
+        if field is self.field:
+            return self
+        return Renderer(
+            field,
+            self.sampler,
+            self.background,
+            precision=self.precision,
+            stop_transmittance=self.stop_transmittance,
+            quadrature=self.quadrature,
+        ).train(self.training)
 
     @torch.no_grad()
     def render_image(self, camera: Camera, time: float, *, chunk: int = 16384) -> Rendering:

@@ -11,7 +11,17 @@ from torch.nn.functional import embedding_bag
 from dnerf.benchmarks.machine import Rates, measure_rates
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import num_threads, time_in_turn
-from dnerf.kernels import GridLevels, grid_encode, march, packed_sum, packed_weights, skip_distances, use_backend
+from dnerf.kernels import (
+    GridLevels,
+    brick_lookup,
+    grid_encode,
+    march,
+    packed_sum,
+    packed_weights,
+    skip_distances,
+    use_backend,
+)
+from dnerf.kernels.brick_lookup import BRICK, VERTICES
 from dnerf.kernels.grid_encode import HASH_PRIMES
 from dnerf.rays import Rays
 
@@ -22,6 +32,8 @@ RESOLUTIONS = (16, 32, 64, 128)
 NUM_FEATURES = 8
 MAX_ROWS = 1 << 17
 STEP = 0.03
+LATTICE = 384  # cells per side of the bricks' lattice
+ALONE = ("march", "brick_lookup")  # have no quicker form in plain torch than their definition
 
 Call = Callable[[], Any]
 
@@ -106,6 +118,14 @@ class Workload:
         self.positions = (positions / 3 + 0.5).contiguous()
         self.levels = GridLevels(RESOLUTIONS, MAX_ROWS)
         self.table = torch.randn(self.levels.num_rows, NUM_FEATURES, generator=generator).to(device)
+        self.cells = self.positions * LATTICE
+        side = LATTICE // BRICK
+        needed = (self.cells / BRICK).long().clamp(0, side - 1)
+        self.slots = torch.full((side,) * 3, -1, device=device)
+        self.slots[needed.unbind(-1)] = 0
+        places = (self.slots == 0).nonzero()
+        self.slots[places.unbind(-1)] = torch.arange(len(places), device=device)
+        self.bricks = torch.randn(len(places), VERTICES, 4, generator=generator).to(device)
         self.depth = torch.rand(self.num_samples, generator=generator).to(device)
         self.values = torch.rand(self.num_samples, 5, generator=generator).to(device)
         self.weights = packed_weights(self.depth, self.marched.offsets)
@@ -116,6 +136,12 @@ class Workload:
             r.origins, r.directions, r.near, r.far, times=r.times, jitter=self.jitter, occupancy=self.occupancy,
             aabb=self.box, step=STEP, skips=self.skips,
         )  # fmt: skip
+
+    def _used_vertices(self) -> int:
+        """Vertices of the bricks' lattice that the samples' cells have."""
+        corners = torch.cartesian_prod(*[torch.arange(2, device=self.cells.device)] * 3)
+        x, y, z = (self.cells.long()[:, None] + corners).unbind(-1)
+        return int(torch.unique((x * (LATTICE + 1) + y) * (LATTICE + 1) + z).numel())
 
     def cases(self) -> list[Case]:
         """All kernels, forward and (where there is one) backward."""
@@ -128,6 +154,12 @@ class Workload:
         out = 5 * 4 * len(self.rays)
         cases = [
             Case("march", "forward", _backends(self._march), 40 * len(self.rays) + (4 + 4 + 8) * self.num_samples),
+            Case(
+                "brick_lookup",
+                "forward",
+                _backends(lambda: brick_lookup(self.cells, self.slots, self.bricks)),
+                (3 * 4 + 4 * 4 + 1) * self.num_samples + 16 * self._used_vertices(),
+            ),
             *_both(
                 "grid_encode",
                 lambda p, t: grid_encode(p, t, self.levels),
@@ -247,7 +279,7 @@ def _plot(rows: list[dict[str, Any]], direction: str) -> Plot:
     chosen = [row for row in rows if row["direction"] == direction and row["threads"] == cores]
     series = []
     for color, kernel in enumerate(dict.fromkeys(row["kernel"] for row in chosen)):
-        for variant in (COMPILED, PLAIN) if kernel != "march" else (COMPILED, REFERENCE):
+        for variant in (COMPILED, PLAIN) if kernel not in ALONE else (COMPILED, REFERENCE):
             part = [row for row in chosen if row["kernel"] == kernel and row["variant"] == variant]
             xs = [row["samples"] for row in part]
             ys, low, high = (

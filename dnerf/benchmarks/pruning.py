@@ -1,8 +1,7 @@
-"""What pruning costs and saves: occupancy, transmittance cut-off, step, and the lattice of the deformation."""
+"""What pruning costs and saves: occupancy, transmittance cut-off, step, and the lattices of deformation and field."""
 
 import copy
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -13,11 +12,12 @@ from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import time_in_turn
 from dnerf.data.frames import Frames
 from dnerf.deformations import FrameLattice
-from dnerf.fields import DeformedField
+from dnerf.fields import Baking, DeformedField
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
 
 PROBES = 2
+OWN = ("the experiment's own, one frame", "the experiment's own, a sequence")
 FLOOR = 1e-8  # error that is drawn for none
 
 KNOBS = {
@@ -28,6 +28,7 @@ KNOBS = {
     "cut-off": "transmittance at which a ray ends",
     "step": "step along a ray (world units)",
     "lattice": "cells of the lattice that the deformation is kept on",
+    "baking": "cells of the lattice that canonical space is kept on",
 }
 
 
@@ -39,6 +40,7 @@ class Setting(NamedTuple):
     sampler: OccupancySampler
     cut: float = 0.0
     lattice: FrameLattice | None = None
+    baking: Baking | None = None
 
 
 def run(settings: Settings) -> SuiteResult:
@@ -56,7 +58,7 @@ def run(settings: Settings) -> SuiteResult:
     if not isinstance(trained, OccupancySampler):
         raise ValueError(f"pruning.experiment must sample by occupancy, got {type(trained).__name__}")
     chosen = [0, len(frames) // 2]
-    reference = _pictures(renderer, Setting("", None, _everything(trained)), frames, chosen)
+    reference = _pictures(_using(renderer, Setting("", None, _everything(trained))), frames, chosen)
     rows = [
         _measure(renderer, setting, frames, chosen, reference, settings)
         for setting in _settings(renderer, trained, options, settings)
@@ -71,7 +73,8 @@ def run(settings: Settings) -> SuiteResult:
             f"{resolution} pixels rendered in evaluation mode with every setting of one knob at a time. Occupancy "
             "grids are filled from the finished field (`OccupancySampler.fill`, random probes of every cell), so that "
             "their error is what a setting loses; `as trained` is the grid that training left behind, without its "
-            "margin in space if the experiment renders so; `the experiment's own` adds its cut-off and lattice. The "
+            "margin in space if the experiment renders so; `the experiment's own` adds its cut-off and the lattice of "
+            "its deformation, and for a sequence that of canonical space, filled before the clock starts. The "
             f"reference samples the whole box at the trained step, {trained.step_size:g}, and leaves out nothing: "
             "errors are of pruning alone, not of the model. The experiment's own settings: threshold "
             f"{trained.threshold:g}, {int(trained.shape[1:].max())} cells, {int(trained.shape[0])} slabs, cut-off "
@@ -122,8 +125,10 @@ def _settings(
 
     yield Setting("nothing left out", None, _everything(trained))
     yield Setting("as trained", None, trained)
-    own = renderer.field.frame_lattice if isinstance(renderer.field, DeformedField) else None
-    yield Setting("the experiment's own", None, trained, renderer.stop_transmittance, own)
+    field, cut = renderer.field, renderer.stop_transmittance
+    own = (field.frame_lattice, field.baking) if isinstance(field, DeformedField) else (None, None)
+    yield Setting(OWN[0], None, trained, cut, own[0])
+    yield Setting(OWN[1], None, trained, cut, *own)
     for value in options["thresholds"][few]:
         yield Setting("threshold", value, filled(threshold=value))
     for value in options["resolutions"][few]:
@@ -141,35 +146,34 @@ def _settings(
         yield Setting("cut-off", value, trained, value)
     for value in options["lattices"][few]:
         yield Setting("lattice", value, trained, 0.0, FrameLattice(trained.box.tolist(), value))
+    for value in options["bakings"][few]:
+        yield Setting("baking", value, trained, 0.0, None, Baking(trained.box.tolist(), value))
 
 
-@contextmanager
-def _using(renderer: Renderer, setting: Setting) -> Iterator[None]:
-    """Render with a setting within a `with` block."""
+def _using(renderer: Renderer, setting: Setting) -> Renderer:
+    """A renderer of the same model with a setting."""
     field = renderer.field
-    before = renderer.sampler, renderer.stop_transmittance
-    lattice = field.frame_lattice if isinstance(field, DeformedField) else None
-    renderer.sampler, renderer.stop_transmittance = setting.sampler, setting.cut
-    try:
-        if isinstance(field, DeformedField):
-            field.frame_lattice = setting.lattice
-        yield
-    finally:
-        renderer.sampler, renderer.stop_transmittance = before
-        if isinstance(field, DeformedField):
-            field.frame_lattice = lattice
+    if isinstance(field, DeformedField):
+        field = DeformedField(
+            field.deformation, field.canonical, frame_lattice=setting.lattice, baking=setting.baking
+        ).finished()
+    changed = Renderer(
+        field, setting.sampler, renderer.background, precision=renderer.precision, stop_transmittance=setting.cut
+    )
+    return changed.eval()
 
 
-def _pictures(renderer: Renderer, setting: Setting, frames: Frames, chosen: list[int]) -> Tensor:
-    with _using(renderer, setting):
-        return torch.stack([renderer.render_image(frames.camera(i), float(frames.times[i])).rgb for i in chosen])
+def _pictures(renderer: Renderer, frames: Frames, chosen: list[int]) -> Tensor:
+    return torch.stack([renderer.render_image(frames.camera(i), float(frames.times[i])).rgb for i in chosen])
 
 
 def _measure(
     renderer: Renderer, setting: Setting, frames: Frames, chosen: list[int], reference: Tensor, settings: Settings
 ) -> dict[str, Any]:
+    changed = _using(renderer, setting)
+
     def call() -> Tensor:
-        return _pictures(renderer, setting, frames, chosen)
+        return _pictures(changed, frames, chosen)
 
     difference = (call() - reference).abs()
     error = float(difference.square().mean())
@@ -202,7 +206,7 @@ def _num_samples(renderer: Renderer, sampler: OccupancySampler, frames: Frames, 
 def _plot(rows: list[dict[str, Any]], knob: str) -> Plot:
     """One knob's settings beside what is left out by none and by the grid as training left it."""
     series = []
-    for name in ("nothing left out", "as trained", "the experiment's own", knob):
+    for name in ("nothing left out", "as trained", *OWN, knob):
         part = [row for row in rows if row["knob"] == name]
         x, y = [row["median_ms"] for row in part], [max(row["rms_error"], FLOOR) for row in part]
         notes = ["" if row["value"] is None else f"{row['value']:g}" for row in part]

@@ -80,9 +80,9 @@ class FrozenDeformation(Deformation):
         unit = (points - self.low.to(points.dtype)) / self.sides.to(points.dtype)
         self._fill(unit)
         moved = points + grid_encode(unit, self.displacements, self.levels)[:, :3].to(points.dtype)
-        outside = ((unit < 0) | (unit > 1)).any(-1)
-        if bool(outside.any()):
-            rest = outside.nonzero()[:, 0]
+        low, high = unit.aminmax()
+        if not bool((low >= 0) & (high <= 1)):
+            rest = ~((unit >= 0) & (unit <= 1)).all(-1)
             moved[rest] = self.deformation(points[rest], times.reshape(-1)[rest]).to(moved.dtype)
         return moved.reshape(positions.shape)
 
@@ -95,12 +95,12 @@ class FrozenDeformation(Deformation):
     def _fill(self, unit: Tensor) -> None:
         """Ask the deformation at the vertices of the points' cells that are not known yet."""
         size = torch.tensor(self.levels.cells, device=unit.device)
-        x, y, z = (unit.clamp(0, 1) * size.to(unit.dtype)).long().clamp(max=size - 1).unbind(-1)
-        cells = (z * self.is_filled.shape[1] + y) * self.is_filled.shape[2] + x
-        new = cells[~self.is_filled.view(-1)[cells]]
-        if not len(new):
+        x, y, z = torch.minimum((unit * size).clamp_(min=0).long(), size - 1).unbind(-1)
+        rows, columns = self.is_filled.shape[1:]
+        known = self.is_filled.clone()
+        self.is_filled.view(-1).index_fill_(0, x.add(y.add(z, alpha=rows), alpha=columns), True)
+        if torch.equal(known, self.is_filled):
             return
-        self.is_filled.view(-1)[new] = True
         needed = torch.nn.functional.pad(self.is_filled, (0, 1) * 3)
         for axis in range(3):
             length = needed.shape[axis] - 1

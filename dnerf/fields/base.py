@@ -27,6 +27,15 @@ class RadianceField(nn.Module, ABC):
             `FieldOutput` with density (...,) and rgb (..., 3) in [0, 1].
         """
 
+    @property
+    def is_fixed(self) -> bool:
+        """Whether density and colour depend on the position alone, not on time and direction."""
+        return False
+
+    def finished(self) -> "RadianceField":
+        """The field to ask once nothing is learnt any more; itself, unless something can be kept between frames."""
+        return self
+
     def at_time(self, time: float) -> "RadianceField":
         """The field to ask while a frame of one time is rendered; itself, unless something can be kept for it.
 

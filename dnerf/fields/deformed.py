@@ -6,6 +6,7 @@ from torch import Tensor
 
 from dnerf.compositing import FieldOutput
 from dnerf.deformations import Deformation, FrameLattice, IdentityDeformation
+from dnerf.fields.baked import Baking
 from dnerf.fields.base import RadianceField
 
 
@@ -19,15 +20,23 @@ class DeformedField(RadianceField):
         deformation: world -> canonical.
         canonical: field in canonical space; it may use the time as well.
         frame_lattice: where frames see the deformation through a lattice; None for frames that ask it at every sample.
+        baking: how a finished canonical field is kept for the frames of a sequence, if it depends on the position
+            alone; None for frames that ask it at every sample.
     """
 
     def __init__(
-        self, deformation: Deformation, canonical: RadianceField, *, frame_lattice: FrameLattice | None = None
+        self,
+        deformation: Deformation,
+        canonical: RadianceField,
+        *,
+        frame_lattice: FrameLattice | None = None,
+        baking: Baking | None = None,
     ) -> None:
         super().__init__()
         self.deformation = deformation
         self.canonical = canonical
         self.frame_lattice = frame_lattice
+        self.baking = baking
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at positions (..., 3) and times (...,)."""
@@ -39,6 +48,13 @@ class DeformedField(RadianceField):
         output = self.canonical(canonical_positions, directions, times)
         extras = {"canonical_positions": canonical_positions, "positions": positions, "times": times}
         return replace(output, extras={**output.extras, **extras})
+
+    def finished(self) -> RadianceField:
+        """The same with the canonical field baked, if that is wanted and can be done."""
+        if self.baking is None or not self.canonical.is_fixed:
+            return self
+        baked = self.baking.bake(self.canonical)
+        return DeformedField(self.deformation, baked, frame_lattice=self.frame_lattice).train(self.training)
 
     def at_time(self, time: float) -> RadianceField:
         """The same with the deformation kept on the lattice, if there is one and anything moves."""

@@ -88,6 +88,11 @@ class GridField(RadianceField):
             self.head = MLP(in_features, hidden_features, num_layers, out_features=1 + hidden_features)
             self.to_rgb = MLP(hidden_features + self.encode_directions.out_features, hidden_features, 1, out_features=3)
 
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the head sees neither times nor directions."""
+        return self.encode_times is None and self.encode_directions is None
+
     def set_progress(self, progress: float) -> None:
         """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
         if self.window_end is None:

@@ -1,6 +1,7 @@
 """The few loops where the time goes: each a plain-torch definition with compiled versions that agree with it."""
 
 from .backend import BACKENDS, get_backend, set_backend, use_backend
+from .brick_lookup import brick_lookup
 from .grid_encode import GridLevels, grid_encode
 from .march import MarchedSamples, march
 from .packed_sum import packed_sum
@@ -11,6 +12,7 @@ __all__ = [
     "BACKENDS",
     "GridLevels",
     "MarchedSamples",
+    "brick_lookup",
     "get_backend",
     "grid_encode",
     "march",

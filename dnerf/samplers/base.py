@@ -26,6 +26,19 @@ class Sampler(nn.Module, ABC):
             generator: source of randomness in training mode.
         """
 
+    def first(self, rays: Rays, most: int) -> Samples | None:
+        """In evaluation mode, the first samples of each of R rays, for those who look front to back.
+
+        Args:
+            rays: R rays.
+            most: samples of a ray.
+
+        Returns:
+            Packed samples; what `forward` places from the end of a ray's last one on is what would have followed. None
+            from a sampler that cannot tell the first without the others (unless overridden).
+        """
+        return None
+
     def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
         """Pixels of a view in whose rays this sampler may place samples in evaluation mode; all unless overridden.
 

@@ -151,6 +151,16 @@ class OccupancySampler(Sampler):
         jitter = torch.zeros_like(rays.near)
         if self.training:
             jitter.uniform_(generator=generator)
+        samples = self._march(rays, jitter)
+        if self.training and self.min_weight > 0:
+            samples = self._visible(samples, rays, field)
+        return samples.padded(self.pad_to) if self.training else samples
+
+    def first(self, rays: Rays, most: int) -> Samples | None:
+        """In evaluation mode, the first samples of each ray; what lies behind is not marched through."""
+        return None if self.training else self._march(rays, torch.zeros_like(rays.near), most)
+
+    def _march(self, rays: Rays, jitter: Tensor, most: int | None = None) -> Samples:
         occupied, skips = self.occupied, self.skips
         if (not self.training or self.is_narrow) and self.rendered is not None and self.rendered_skips is not None:
             occupied, skips = self.rendered, self.rendered_skips
@@ -164,14 +174,12 @@ class OccupancySampler(Sampler):
             occupancy=occupied,
             aabb=self.box,
             step=self.training_step if self.training else self.step_size,
+            max_samples_per_ray=most,
             skips=skips,
         )
-        samples = Samples(
+        return Samples(
             marched.starts, marched.ends, len(rays), ray_indices=marched.ray_indices, ray_offsets=marched.offsets
         )
-        if self.training and self.min_weight > 0:
-            samples = self._visible(samples, rays, field)
-        return samples.padded(self.pad_to) if self.training else samples
 
     def set_progress(self, progress: float) -> None:
         """Shorten the intervals of training and drop its margin as it goes on, `progress` in [0, 1]."""

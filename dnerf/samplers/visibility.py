@@ -9,51 +9,73 @@ from dnerf.compositing import render_weights, sum_along_rays
 from dnerf.fields.base import RadianceField
 from dnerf.rays import Rays, Samples
 
-Visitor = Callable[[Tensor, Tensor, Samples, Tensor], Tensor]
+Source = Callable[[Tensor, int, int], tuple[Samples, Tensor]]
+Visitor = Callable[[Tensor, Samples, Tensor], Tensor]
 Observer = Callable[[Tensor, Tensor, Tensor], None]
 
 
 @torch.no_grad()
 def walk_front_to_back(
-    samples: Samples, stop_transmittance: float, visit: Visitor, *, first_round: int = 8, pad_to: int = 1
+    source: Source, transmittance: Tensor, stop_transmittance: float, visit: Visitor, *, first_round: int = 8
 ) -> None:
-    """Visit packed samples in rounds: each ray's first few, twice as many, and so on, until it is opaque or at its end.
+    """Visit the samples of rays in rounds: the first few of each, twice as many, and so on, until it is opaque.
 
     Source: early ray termination (Levoy 1990), here for whole batches of rays at a time.
 
     Args:
-        samples: N packed samples of R rays.
+        source: called with the numbers (K,) of rays, how many samples of each have been visited, and a size; returns
+            at most so many further samples of each as packed samples of K rays, and which rays (K,) may have more.
+        transmittance: (R,) of all rays; ones that come to their end are multiplied in place.
         stop_transmittance: a ray whose transmittance has fallen to this takes no further part.
-        visit: called with the numbers (K,) of the rays that take part, the numbers (n,) of their samples, those
-            samples as packed samples of K rays, and the rays' transmittance (K,) before them; returns the share (K,)
-            of light that passes them.
+        visit: called with the numbers (K,) of the rays that take part, their samples, and their transmittance (K,)
+            before them; returns the share (K,) of light that passes them.
         first_round: samples per ray in the first round.
-        pad_to: rounds are padded to a multiple of so many samples, see `Samples.padded`.
     """
-    offsets, counts = samples.offsets, samples.offsets.diff()
-    transmittance = samples.starts.new_ones(samples.num_rays)
-    open_rays = (counts > 0).nonzero()[:, 0]
+    rays = torch.arange(len(transmittance), device=transmittance.device)
     taken, size = 0, first_round
-    while len(open_rays):
-        used = (counts[open_rays] - taken).clamp(max=size)
-        part_offsets = torch.nn.functional.pad(used.cumsum(0), (1, 0))
-        total = int(part_offsets[-1])
-        local = torch.repeat_interleave(used, output_size=total)
-        shift = (offsets[open_rays] + taken - part_offsets[:-1]).index_select(0, local)
-        chosen = torch.arange(total, device=local.device) + shift
-        part = Samples(
-            samples.starts.index_select(0, chosen),
-            samples.ends.index_select(0, chosen),
-            len(open_rays),
-            ray_indices=local,
-            points=None if samples.points is None else samples.points.index_select(0, chosen),
-            ray_offsets=part_offsets,
-        )
-        before = transmittance[open_rays]
-        after = before * visit(open_rays, chosen, part.padded(pad_to), before)
-        transmittance[open_rays] = after
+    while len(rays):
+        part, has_more = source(rays, taken, size)
+        before = transmittance[rays]
+        after = before * visit(rays, part, before)
+        transmittance[rays] = after
         taken, size = taken + size, 2 * size
-        open_rays = open_rays[(after > stop_transmittance) & (counts[open_rays] > taken)]
+        rays = rays[(after > stop_transmittance) & has_more]
+
+
+class PackedRounds:
+    """Packed samples as the source of `walk_front_to_back`.
+
+    Args:
+        samples: N packed samples of R rays.
+        pad_to: rounds are padded to a multiple of so many samples, see `Samples.padded`.
+
+    Attributes:
+        chosen: (n,) numbers of the samples of the latest round.
+    """
+
+    def __init__(self, samples: Samples, pad_to: int = 1) -> None:
+        self.samples = samples
+        self.pad_to = pad_to
+        self.counts = samples.offsets.diff()
+        self.chosen = torch.empty(0, dtype=torch.int64)
+
+    def __call__(self, rays: Tensor, taken: int, size: int) -> tuple[Samples, Tensor]:
+        """The samples of some rays from number `taken` on."""
+        samples, counts = self.samples, self.counts[rays]
+        offsets = torch.nn.functional.pad((counts - taken).clamp(0, size).cumsum(0), (1, 0))
+        total = int(offsets[-1])
+        local = torch.repeat_interleave(offsets.diff(), output_size=total)
+        shift = (samples.offsets[rays] + taken - offsets[:-1]).index_select(0, local)
+        self.chosen = torch.arange(total, device=local.device) + shift
+        part = Samples(
+            samples.starts.index_select(0, self.chosen),
+            samples.ends.index_select(0, self.chosen),
+            len(rays),
+            ray_indices=local,
+            points=None if samples.points is None else samples.points.index_select(0, self.chosen),
+            ray_offsets=offsets,
+        )
+        return part.padded(self.pad_to), counts > taken + size
 
 
 @torch.no_grad()
@@ -86,17 +108,19 @@ def visible_samples(
     """
     marked = torch.zeros_like(samples.starts, dtype=torch.bool)
 
-    def visit(ray_numbers: Tensor, chosen: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
+    rounds = PackedRounds(samples, pad_to)
+
+    def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
         positions, _, times = part.locate(rays[ray_numbers])
         density = field.density(positions, times)
         if observe is not None:
             observe(positions, times, density)
         optical_depth = density * part.lengths
         weights = render_weights(optical_depth, part) * part.per_sample(transmittance)
-        marked[chosen] = weights[: len(chosen)] > min_weight
+        marked[rounds.chosen] = weights[: len(rounds.chosen)] > min_weight
         return torch.exp(-sum_along_rays(optical_depth, part))
 
-    walk_front_to_back(samples, min_weight, visit, first_round=first_round, pad_to=pad_to)
+    walk_front_to_back(rounds, samples.starts.new_ones(len(rays)), min_weight, visit, first_round=first_round)
     return marked
 
 

@@ -1,6 +1,7 @@
 """Occupancy-guided sampling: empty space is skipped, matter never is, and lost matter comes back."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -311,3 +312,33 @@ def test_the_grid_of_evaluation_decides_what_is_seen() -> None:
     sampler.occupied.fill_(True)
     sampler.rendered.fill_(False)
     assert len(sampler.seen_pixels(camera_at((3.0, 0.0, 0.0)), 0.5)) == 0
+
+
+@pytest.mark.parametrize("most", [1, 3, 8])
+def test_first_samples_and_what_follows_are_all_samples(most: int) -> None:
+    """Marched piece by piece, each from the end of the last, a ray has the samples of one march."""
+    sampler = OccupancySampler(BOX, 0.05, 16, margin=0).eval()
+    generator = torch.Generator().manual_seed(4)
+    sampler.occupy(torch.rand(sampler.occupied.shape, generator=generator) < 0.3)
+    rays = rays_towards_origin(40)
+    whole = sampler(rays, fog())
+    begins, pieces = rays.near.clone(), []
+    for _ in range(200):
+        part = sampler.first(replace(rays, near=begins), most)
+        assert part is not None
+        assert int(part.offsets.diff().max()) <= most
+        pieces.append(part)
+        if not len(part.starts):
+            break
+        last = part.offsets.diff() > 0
+        begins[last] = part.ends[part.offsets[1:][last] - 1]
+    starts = torch.cat([p.starts for p in pieces])
+    indices = torch.cat([p.ray_indices for p in pieces if p.ray_indices is not None])
+    order = indices.argsort(stable=True)
+    assert torch.equal(indices[order], whole.ray_indices)
+    # The end of one piece is the origin of the next: an interval's place rounds differently.
+    torch.testing.assert_close(starts[order], whole.starts, rtol=0, atol=2e-6)
+
+
+def test_training_does_not_march_in_pieces() -> None:
+    assert OccupancySampler(BOX, 0.05).train().first(rays_towards_origin(4), 2) is None

@@ -1,0 +1,140 @@
+"""A finished canonical field on a lattice of bricks: what frames of a sequence share is computed once."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dnerf.checks import as_box, check_positive
+from dnerf.compositing import FieldOutput
+from dnerf.deformations.base import check_positions_times
+from dnerf.fields.base import RadianceField
+from dnerf.kernels import brick_lookup
+from dnerf.kernels.brick_lookup import BRICK, VERTICES
+
+CHUNK = 32  # bricks asked at a time, always as many: matrix libraries compile code for every new number of rows
+FAINT = 1e-20  # density, in 1 / world unit, that stands for none: its logarithm is finite
+
+
+class Baking:
+    """The geometry of lattices that stand in for a finished canonical field.
+
+    Every frame of a sequence looks at the same canonical matter. Logarithms of density and colours at the vertices of
+    a fine lattice, interpolated linearly, cost one lookup; a multi-resolution grid costs one per level, and a network.
+    Vertices are computed when a sample first falls near them, brick by brick, so that only what is looked at exists.
+    The field is exact at vertices, and the error falls with the square of the cells' size where it is smooth.
+
+    Args:
+        box: (2, 3) corners of the lattice, in world units; outside it the field itself is asked.
+        resolution: cells along the box's longest side.
+        max_bricks: most bricks of 8 x 8 x 8 cells that are kept (12 KiB each); beyond, the field itself is asked.
+
+    Raises:
+        ValueError: for a box that is none, or numbers that are not positive.
+    """
+
+    def __init__(self, box: Sequence[Sequence[float]], resolution: int = 384, *, max_bricks: int = 1 << 14) -> None:
+        check_positive("resolution", resolution)
+        check_positive("max_bricks", max_bricks)
+        self.box = as_box(box)
+        sides = self.box[1] - self.box[0]
+        self.cells_per_unit = resolution / float(sides.max())
+        self.shape = [math.ceil(round(float(s) * self.cells_per_unit / BRICK, 3)) for s in sides]
+        self.max_bricks = max_bricks
+
+    def bake(self, field: RadianceField) -> "BakedField":
+        """A stand-in for a field that nothing changes any more.
+
+        Raises:
+            ValueError: if the field depends on more than the position.
+        """
+        return BakedField(field, self)
+
+
+class BakedField(RadianceField):
+    """A field seen through a lattice that is filled where positions fall; see `Baking`.
+
+    For rendering: it knows nothing of later changes of the field, and no gradient reaches it.
+
+    Args:
+        field: what is asked at vertices; it may depend on nothing but the position.
+        baking: where they are.
+
+    Raises:
+        ValueError: if the field depends on more than the position.
+    """
+
+    def __init__(self, field: RadianceField, baking: Baking) -> None:
+        super().__init__()
+        if not field.is_fixed:
+            raise ValueError("field must depend on the position alone, got one that depends on time or direction")
+        self.field = field
+        self.low = baking.box[0]
+        self.cells_per_unit = baking.cells_per_unit
+        self.max_bricks = baking.max_bricks
+        self.num_bricks = 0
+        self.slots = torch.full(baking.shape, -1)  # per brick of the box: its number, -1 if it does not exist
+        self.bricks = torch.zeros(0, VERTICES, 4)  # at its vertices: the density's logarithm, rgb
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Density (...,) at positions (..., 3) and any times (...,)."""
+        return self(positions, positions, times).density
+
+    @torch.no_grad()
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and times (...,)."""
+        check_positions_times(positions, times)
+        self._to(positions.device)
+        points = positions.reshape(-1, 3)
+        cells = (points - self.low.to(points.dtype)) * self.cells_per_unit
+        values, is_known = brick_lookup(cells, self.slots, self.bricks)
+        if self._fill(cells[~is_known]):
+            values, is_known = brick_lookup(cells, self.slots, self.bricks)
+        values = values.to(points.dtype)
+        if not bool(is_known.all()):
+            rest = (~is_known).nonzero()[:, 0]
+            values[rest] = self._ask(points[rest]).to(points.dtype)
+        values = values.reshape(*positions.shape[:-1], 4)
+        return FieldOutput(density=values[..., 0].exp(), rgb=values[..., 1:])
+
+    def _ask(self, points: Tensor) -> Tensor:
+        output = self.field(points, torch.zeros_like(points), points.new_zeros(len(points)))
+        return torch.cat([output.density.clamp(min=FAINT).log()[:, None], output.rgb.to(output.density.dtype)], dim=-1)
+
+    def _to(self, device: torch.device) -> None:
+        if self.slots.device != device:
+            self.low, self.slots, self.bricks = (x.to(device) for x in (self.low, self.slots, self.bricks))
+
+    def _fill(self, cells: Tensor) -> bool:
+        """Make the bricks around places in cells (n, 3), as long as there is room for them; whether any is new."""
+        if not len(cells) or self.num_bricks == self.max_bricks:
+            return False
+        shape = torch.tensor(self.slots.shape, device=cells.device)
+        cells = cells[((cells >= 0) & (cells <= shape * BRICK)).all(-1)]
+        is_new = torch.zeros_like(self.slots, dtype=torch.bool)
+        is_new[torch.minimum(cells.long() // BRICK, shape - 1).unbind(-1)] = True
+        new = is_new.nonzero()[: self.max_bricks - self.num_bricks]
+        if not len(new):
+            return False
+        side = torch.arange(BRICK + 1, device=cells.device)
+        vertices = torch.cartesian_prod(side, side, side)
+        made = []
+        for part in (new * BRICK).split(CHUNK):
+            asked = torch.cat([part, part[-1:].expand(CHUNK - len(part), 3)])
+            points = self.low + (asked[:, None] + vertices).reshape(-1, 3) / self.cells_per_unit
+            values = self._ask(points)[: len(part) * VERTICES]
+            made.append(values.to(self.bricks.dtype).reshape(-1, VERTICES, 4))
+        end = self.num_bricks + len(new)
+        self._make_room(end)
+        self.bricks[self.num_bricks : end] = torch.cat(made)
+        self.slots[new.unbind(-1)] = torch.arange(self.num_bricks, end, device=cells.device)
+        self.num_bricks = end
+        return True
+
+    def _make_room(self, count: int) -> None:
+        """Room for so many bricks; if there was less, for twice as many as before at least."""
+        held = len(self.bricks)
+        if count > held:
+            more = min(max(count, 2 * held), self.max_bricks) - held
+            self.bricks = torch.cat([self.bricks, self.bricks.new_zeros(more, VERTICES, 4)])

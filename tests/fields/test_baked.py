@@ -1,0 +1,159 @@
+"""The lattice of bricks that stands in for a finished canonical field."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.cameras import Camera, Intrinsics, look_at
+from dnerf.compositing import FieldOutput
+from dnerf.deformations import DisplacementDeformation, FrameLattice
+from dnerf.fields import BakedField, Baking, DeformedField, GridField, RadianceField
+from dnerf.renderer import Renderer
+from dnerf.samplers import OccupancySampler
+
+BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5]]
+
+
+class Smooth(RadianceField):
+    """A field whose log-density and colours bend smoothly, and which counts what it is asked."""
+
+    is_fixed = True
+    num_points = 0
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        return self(positions, positions, times).density
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        self.num_points += times.numel()
+        return FieldOutput(
+            density=torch.exp(2 * torch.sin(2 * positions).sum(-1)), rgb=0.5 + 0.5 * torch.sin(3 * positions)
+        )
+
+
+def points(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
+    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+    low, high = torch.tensor(BOX, dtype=dtype)
+    return torch.lerp(low, high, unit)
+
+
+def asked(field: RadianceField, positions: Tensor) -> FieldOutput:
+    output = field(positions, positions, positions.new_zeros(len(positions)))
+    assert isinstance(output, FieldOutput)
+    return output
+
+
+def errors(resolution: int) -> tuple[float, float]:
+    field, x = Smooth(), points(3000)
+    baked, exact = asked(Baking(BOX, resolution).bake(field), x), asked(field, x)
+    return float((baked.density / exact.density).log().abs().max()), float((baked.rgb - exact.rgb).abs().max())
+
+
+def test_error_falls_with_the_square_of_the_cells_and_stays_below_its_bound() -> None:
+    found = {resolution: errors(resolution) for resolution in (16, 32, 64)}
+    for resolution, (depth, color) in found.items():
+        square = (2 / resolution) ** 2 / 8  # linear interpolation of f errs by at most |f''| h^2 / 8 along each axis
+        assert depth <= 3 * 8 * square + 1e-5  # the lattice holds float32, logarithms up to 6
+        assert color <= 4.5 * square + 1e-6
+    for coarse, fine in ((16, 32), (32, 64)):
+        assert all(a / b > 3.3 for a, b in zip(found[coarse], found[fine], strict=True))
+
+
+def test_only_bricks_with_points_are_asked_and_once() -> None:
+    field = Smooth()
+    baked = Baking(BOX, 64).bake(field)
+    x = torch.tensor([[0.3, 0.2, 0.1], [0.31, 0.21, 0.11], [-0.7, 0.0, 0.0]])
+    asked(baked, x)
+    assert baked.num_bricks == 2
+    before = field.num_points
+    again = asked(baked, x)
+    assert field.num_points == before
+    torch.testing.assert_close(again.density, asked(field, x).density, rtol=2e-2, atol=0)
+
+
+def test_what_is_kept_does_not_depend_on_the_order_in_which_it_was_asked() -> None:
+    torch.manual_seed(0)
+    field = GridField(BOX, (8, 16), 4, hidden_features=16, num_layers=1)
+    x = points(500, dtype=torch.float32)
+    first, second = Baking(BOX, 48).bake(field), Baking(BOX, 48).bake(field)
+    for i in reversed(range(0, 500, 100)):
+        asked(second, x[i : i + 100])
+    assert torch.equal(asked(first, x).density, asked(second, x).density)
+
+
+def test_outside_the_box_and_beyond_the_room_the_field_itself_is_asked() -> None:
+    field = Smooth()
+    outside = points(100) + torch.tensor([3.0, 0, 0])
+    assert torch.equal(asked(Baking(BOX, 16).bake(field), outside).density, asked(field, outside).density.log().exp())
+    baked = Baking(BOX, 64, max_bricks=3).bake(field)
+    x = points(400)
+    output = asked(baked, x)
+    assert baked.num_bricks == len(baked.bricks) == 3
+    torch.testing.assert_close(output.density, asked(field, x).density, rtol=2e-2, atol=0)
+    direct = (output.density / asked(field, x).density - 1).abs() < 1e-12
+    assert direct.sum() > 300
+
+
+def test_any_shape_is_answered_and_nothing_is_nothing() -> None:
+    baked = Baking(BOX, 16).bake(Smooth())
+    output = baked(torch.zeros(2, 3, 3), torch.zeros(2, 3, 3), torch.zeros(2, 3))
+    assert output.density.shape == (2, 3)
+    assert output.rgb.shape == (2, 3, 3)
+    assert baked.density(torch.zeros(0, 3), torch.zeros(0)).shape == (0,)
+
+
+def test_empty_space_stays_empty() -> None:
+    class Nothing(Smooth):
+        def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+            return FieldOutput(density=positions.new_zeros(positions.shape[:-1]), rgb=torch.zeros_like(positions))
+
+    output = asked(Baking(BOX, 16).bake(Nothing()), points(50))
+    assert float(output.density.max()) < 1e-19  # a logarithm of nothing is not finite
+    assert not output.rgb.any()
+
+
+@pytest.mark.parametrize("options", [{"time_frequencies": 2}, {"view_degree": 2}])
+def test_fields_that_change_are_not_baked(options: dict[str, Any]) -> None:
+    field = GridField(BOX, (4,), 2, **options)
+    with pytest.raises(ValueError, match="must depend on the position alone"):
+        Baking(BOX, 16).bake(field)
+    model = DeformedField(DisplacementDeformation(1, 8, ()), field, baking=Baking(BOX, 16))
+    assert model.finished() is model
+
+
+@pytest.mark.parametrize(("name", "value"), [("resolution", 0), ("max_bricks", -1)])
+def test_numbers_out_of_range_are_refused(name: str, value: int) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        Baking(BOX, **{name: value})
+
+
+def test_sequences_show_the_same_pictures() -> None:
+    torch.manual_seed(0)
+    canonical = GridField(BOX, (8, 16), 4, hidden_features=16, num_layers=1, density_shift=1.0)
+    with torch.no_grad():
+        canonical.table.mul_(100)
+    deformation = DisplacementDeformation(1, 16, (), position_frequencies=1, time_frequencies=1)
+    field = DeformedField(deformation, canonical, frame_lattice=FrameLattice(BOX, 16), baking=Baking(BOX, 128))
+    renderer = Renderer(field, OccupancySampler(BOX, 0.05), stop_transmittance=1e-3)
+    camera = Camera(Intrinsics.from_angle(24, 24, 0.7), look_at((3.0, 0.5, 1.0)), near=1.0, far=6.0)
+    finished = renderer.for_sequence(60)
+    assert finished.field is not field
+    assert renderer.for_sequence(2) is renderer
+    for time in (0.0, 0.5, 0.0):
+        exact, baked = renderer.render_image(camera, time), finished.render_image(camera, time)
+        assert float(exact.opacity.max()) > 0.5
+        # Kinks of 16 cells lie on vertices of 128, so only the head bends between these.
+        torch.testing.assert_close(baked.rgb, exact.rgb, rtol=0, atol=5e-3)
+
+
+def test_a_renderer_that_keeps_nothing_renders_sequences_itself() -> None:
+    renderer = Renderer(Smooth(), OccupancySampler(BOX, 0.05))
+    assert renderer.for_sequence(60) is renderer
+
+
+def test_baked_fields_keep_nothing_that_is_saved() -> None:
+    field = GridField(BOX, (4,), 2)
+    baked = Baking(BOX, 16).bake(field)
+    assert isinstance(baked, BakedField)
+    assert set(baked.state_dict()) == {f"field.{name}" for name in field.state_dict()}
