@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 import torch
@@ -93,11 +94,9 @@ def run(settings: Settings) -> SuiteResult:
     )
 
 
-def _grid(
-    trained: OccupancySampler, *, resolution: int, num_slabs: int, threshold: float = 1.0, step: float | None = None
-) -> OccupancySampler:
+def _grid(trained: OccupancySampler, *, resolution: int, num_slabs: int) -> OccupancySampler:
     grid = OccupancySampler(
-        trained.box.tolist(), step or trained.step_size, resolution, num_slabs=num_slabs, threshold=threshold,
+        trained.box.tolist(), trained.step_size, resolution, num_slabs=num_slabs, threshold=trained.threshold,
         margin=trained.margin, pad_to=trained.pad_to,
     )  # fmt: skip
     return grid.to(trained.box.device).eval()
@@ -117,10 +116,18 @@ def _settings(
         slabs, cells = 4, 16
     few = slice(None, None, 3) if settings.quick else slice(None)
 
-    def filled(**changes: Any) -> OccupancySampler:
-        grid = _grid(trained, **{"resolution": cells, "num_slabs": slabs, "threshold": trained.threshold, **changes})
+    @cache
+    def filled(resolution: int, num_slabs: int) -> OccupancySampler:
+        grid = _grid(trained, resolution=resolution, num_slabs=num_slabs)
         with torch.no_grad():
             grid.fill(renderer.field, 1 if settings.quick else PROBES)
+        return grid
+
+    def changed(**numbers: float) -> OccupancySampler:
+        grid = copy.deepcopy(filled(cells, slabs))
+        for name, number in numbers.items():
+            setattr(grid, name, number)
+        grid.decide(is_filled=True)
         return grid
 
     yield Setting("nothing left out", None, _everything(trained))
@@ -130,18 +137,18 @@ def _settings(
     yield Setting(OWN[0], None, trained, cut, own[0])
     yield Setting(OWN[1], None, trained, cut, *own)
     for value in options["thresholds"][few]:
-        yield Setting("threshold", value, filled(threshold=value))
+        yield Setting("threshold", value, changed(threshold=value))
     for value in options["resolutions"][few]:
-        yield Setting("resolution", value, filled(resolution=value))
+        yield Setting("resolution", value, filled(value, slabs))
     for value in options["slabs"][few]:
-        yield Setting("slabs", value, filled(num_slabs=value))
+        yield Setting("slabs", value, filled(cells, value))
     if trained.rendered is not None:
         wide = copy.deepcopy(trained)
         wide.occupy(trained.occupied)
         yield Setting("margin", 1, wide)
         yield Setting("margin", 0, trained)
     for value in options["steps"][few]:
-        yield Setting("step", value, filled(step=value))
+        yield Setting("step", value, changed(step_size=value))
     for value in options["cuts"][few]:
         yield Setting("cut-off", value, trained, value)
     for value in options["lattices"][few]:

@@ -250,7 +250,7 @@ class OccupancySampler(Sampler):
         within = torch.rand(self.num_probes, 4, generator=generator, device=device)
         self.maxima.mul_(self.decay).clamp_(min=NEGLIGIBLE * 1e-3)
         self._probe(field, cells, within)
-        self._decide()
+        self.decide()
 
     @torch.no_grad()
     def fill(self, field: RadianceField, probes_per_cell: int = 8, *, chunk: int = 1 << 18) -> None:
@@ -270,7 +270,21 @@ class OccupancySampler(Sampler):
         for _ in range(probes_per_cell):
             for cells in torch.arange(self.maxima.numel(), device=device).split(chunk):
                 self._probe(field, cells, torch.rand(len(cells), 4, generator=generator, device=device))
-        self._decide(is_filled=True)
+        self.decide(is_filled=True)
+
+    def decide(self, *, is_filled: bool = False) -> None:
+        """Decide from the maxima which cells are occupied; `fill` and `update` do so themselves.
+
+        Args:
+            is_filled: whether the maxima are those of a finished field, see `fill`.
+        """
+        threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
+        dense = self.maxima > threshold
+        occupied = _widened(_widened(dense, [0]), SPACE if self.margin else [])
+        if is_filled or self.rendered is None:
+            self._set(occupied, occupied.repeat_interleave(2, dim=0))
+        else:
+            self._set(occupied, _widened(_halves(dense), SPACE if self.render_margin else []))
 
     def _probe(self, field: RadianceField, cells: Tensor, within: Tensor) -> None:
         density = field.density(*self._within(cells, within))
@@ -280,15 +294,6 @@ class OccupancySampler(Sampler):
         """Positions (N, 3) and times (N,) at places (N, 4) in [0, 1] within cells (N,)."""
         unit = (torch.stack(torch.unravel_index(cells, self.maxima.shape), dim=-1) + within) / self.shape
         return torch.lerp(self.box[0], self.box[1], unit[:, 1:]), unit[:, 0]
-
-    def _decide(self, *, is_filled: bool = False) -> None:
-        threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
-        dense = self.maxima > threshold
-        occupied = _widened(_widened(dense, [0]), SPACE if self.margin else [])
-        if is_filled or self.rendered is None:
-            self._set(occupied, occupied.repeat_interleave(2, dim=0))
-        else:
-            self._set(occupied, _widened(_halves(dense), SPACE if self.render_margin else []))
 
     @torch.no_grad()
     def occupy(self, mask: Tensor) -> None:

@@ -80,7 +80,7 @@ def render_frames_to(
         raise ValueError(f"views must be {store.num_frames} as the store's frames, got {len(views)}")
     share = share or Share()
     missing = [i for i in store.missing() if share.mine(i)]
-    renderer = renderer.for_sequence(len(missing))
+    renderer = renderer.for_sequence(len(views))  # of all, so that a frame is the same whoever renders it
     for index in missing:
         following = views[index + 1] if index + 1 < len(views) else None
         store.write(index, render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk))

@@ -65,7 +65,7 @@ def test_occupied_cells_are_widened_by_one_cell_and_one_slab() -> None:
     sampler = small()
     sampler.maxima.zero_()
     sampler.maxima[3, 7, 8, 0] = 100.0
-    sampler._decide()
+    sampler.decide()
     slabs, x, y, z = (sampler.occupied.nonzero()[:, axis].unique().tolist() for axis in range(4))
     assert (slabs, x, y, z) == ([2, 3, 4], [6, 7, 8], [7, 8, 9], [0, 1])
     assert sampler.occupied.sum() == 3 * 3 * 3 * 2
@@ -75,7 +75,7 @@ def test_pictures_may_do_without_the_margin_in_space() -> None:
     sampler = small(render_margin=0)
     sampler.maxima.zero_()
     sampler.maxima[3, 6:10, 6:10, 6:10] = 100.0
-    sampler._decide()
+    sampler.decide()
     assert sampler.occupied.sum() == 3 * 6**3
     assert sampler.rendered is not None
     # Slab 3 is halves 6 and 7; the half before and the half after see it as well.
@@ -248,7 +248,7 @@ def test_nothing_is_not_padded() -> None:
 def test_training_drops_the_margin_when_told() -> None:
     sampler = small(render_margin=0, narrow_from=0.3)
     sampler.fill(MovingBall())
-    sampler._decide()
+    sampler.decide()
     rays = rays_towards_origin(40)
 
     def count() -> int:
