@@ -22,6 +22,7 @@ logger = logging.getLogger(__name__)
 
 PAD_TO = 2048  # samples; see `Samples.padded`
 FRAMES_THAT_SHARE = 16  # from so many on a sequence has gained what keeping things between its frames costs
+MOST_TO_SHARE = 0.1  # of space, in which samples fall: haze is dearer to keep than to ask
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
 
 
@@ -158,10 +159,12 @@ class Renderer(nn.Module):
     def for_sequence(self, num_frames: int) -> "Renderer":
         """A renderer of the same finished model for so many frames; this one, unless sharing work between them pays.
 
-        What the frames share is computed as they come and kept (`RadianceField.finished`), so it knows nothing of later
-        changes of the field. Sampler and background are this renderer's own.
+        It does for long sequences of scenes that are mostly empty. What the frames share is computed as they come and
+        kept (`RadianceField.finished`), so it knows nothing of later changes of the field. Sampler and background are
+        this renderer's own.
         """
-        field = self.field if num_frames < FRAMES_THAT_SHARE else self.field.finished()
+        pays = num_frames >= FRAMES_THAT_SHARE and self.sampler.share <= MOST_TO_SHARE
+        field = self.field.finished() if pays else self.field
         if field is self.field:
             return self
         return Renderer(

@@ -28,7 +28,7 @@ class Baking:
     Args:
         box: (2, 3) corners of the lattice, in world units; outside it the field itself is asked.
         resolution: cells along the box's longest side.
-        max_bricks: most bricks of 8 x 8 x 8 cells that are kept (12 KiB each); beyond, the field itself is asked.
+        max_bricks: most bricks of 8 x 8 x 8 cells that are kept (12 KiB each); if more are needed, all are forgotten.
 
     Raises:
         ValueError: for a box that is none, or numbers that are not positive.
@@ -88,15 +88,29 @@ class BakedField(RadianceField):
         self._to(positions.device)
         points = positions.reshape(-1, 3)
         cells = (points - self.low.to(points.dtype)) * self.cells_per_unit
-        values, is_known = brick_lookup(cells, self.slots, self.bricks)
-        if self._fill(cells[~is_known]):
-            values, is_known = brick_lookup(cells, self.slots, self.bricks)
+        values, is_known = self._values(cells)
         values = values.to(points.dtype)
         if not bool(is_known.all()):
             rest = (~is_known).nonzero()[:, 0]
             values[rest] = self._ask(points[rest]).to(points.dtype)
         values = values.reshape(*positions.shape[:-1], 4)
         return FieldOutput(density=values[..., 0].exp(), rgb=values[..., 1:])
+
+    def _values(self, cells: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (N, 4) at places (N, 3) in cells, and whether they are in the box (N,)."""
+        found = brick_lookup(cells, self.slots, self.bricks)
+        missing = self._missing(cells[~found[1]])
+        if not len(missing):
+            return found
+        if self.num_bricks + len(missing) > self.max_bricks:
+            self.slots.fill_(-1)
+            self.num_bricks = 0
+            missing = self._missing(cells)
+            if len(missing) > self.max_bricks:
+                halves = [self._values(part) for part in cells.split(-(-len(cells) // 2))]
+                return torch.cat([h[0] for h in halves]), torch.cat([h[1] for h in halves])
+        self._make(missing)
+        return brick_lookup(cells, self.slots, self.bricks)
 
     def _ask(self, points: Tensor) -> Tensor:
         output = self.field(points, torch.zeros_like(points), points.new_zeros(len(points)))
@@ -106,31 +120,27 @@ class BakedField(RadianceField):
         if self.slots.device != device:
             self.low, self.slots, self.bricks = (x.to(device) for x in (self.low, self.slots, self.bricks))
 
-    def _fill(self, cells: Tensor) -> bool:
-        """Make the bricks around places in cells (n, 3), as long as there is room for them; whether any is new."""
-        if not len(cells) or self.num_bricks == self.max_bricks:
-            return False
+    def _missing(self, cells: Tensor) -> Tensor:
+        """Which bricks (K, 3) around places in cells (n, 3) do not exist."""
         shape = torch.tensor(self.slots.shape, device=cells.device)
         cells = cells[((cells >= 0) & (cells <= shape * BRICK)).all(-1)]
-        is_new = torch.zeros_like(self.slots, dtype=torch.bool)
-        is_new[torch.minimum(cells.long() // BRICK, shape - 1).unbind(-1)] = True
-        new = is_new.nonzero()[: self.max_bricks - self.num_bricks]
-        if not len(new):
-            return False
-        side = torch.arange(BRICK + 1, device=cells.device)
+        is_wanted = torch.zeros_like(self.slots, dtype=torch.bool)
+        is_wanted[torch.minimum(cells.long() // BRICK, shape - 1).unbind(-1)] = True
+        return (is_wanted & (self.slots < 0)).nonzero()
+
+    def _make(self, missing: Tensor) -> None:
+        side = torch.arange(BRICK + 1, device=missing.device)
         vertices = torch.cartesian_prod(side, side, side)
-        made = []
-        for part in (new * BRICK).split(CHUNK):
+        end = self.num_bricks + len(missing)
+        self._make_room(end)
+        numbers = torch.arange(self.num_bricks, end, device=missing.device)
+        for part, number in zip((missing * BRICK).split(CHUNK), numbers.split(CHUNK), strict=True):
             asked = torch.cat([part, part[-1:].expand(CHUNK - len(part), 3)])
             points = self.low + (asked[:, None] + vertices).reshape(-1, 3) / self.cells_per_unit
-            values = self._ask(points)[: len(part) * VERTICES]
-            made.append(values.to(self.bricks.dtype).reshape(-1, VERTICES, 4))
-        end = self.num_bricks + len(new)
-        self._make_room(end)
-        self.bricks[self.num_bricks : end] = torch.cat(made)
-        self.slots[new.unbind(-1)] = torch.arange(self.num_bricks, end, device=cells.device)
+            values = self._ask(points).to(self.bricks.dtype).reshape(CHUNK, VERTICES, 4)
+            self.bricks[number] = values[: len(part)]
+        self.slots[missing.unbind(-1)] = numbers
         self.num_bricks = end
-        return True
 
     def _make_room(self, count: int) -> None:
         """Room for so many bricks; if there was less, for twice as many as before at least."""

@@ -51,6 +51,11 @@ class Sampler(nn.Module, ABC):
         """
         return None
 
+    @property
+    def share(self) -> float:
+        """Share of space, averaged over time, in which pictures have samples; 1 unless known to be less."""
+        return 1.0
+
     def places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
         """Random places where matter may be, evenly spread over all of them; None if this sampler does not know.
 

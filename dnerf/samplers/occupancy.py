@@ -187,6 +187,11 @@ class OccupancySampler(Sampler):
         self.training_step = self.coarse_step * (self.step_size / self.coarse_step) ** part
         self.is_narrow = progress >= self.narrow_from
 
+    @property
+    def share(self) -> float:
+        """Share of the cells that pictures look into."""
+        return float((self.occupied if self.rendered is None else self.rendered).float().mean())
+
     @torch.no_grad()
     def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
         """Pixels inside the rectangles that occupied cells cover on the picture; all if a cell lies beside the camera.
