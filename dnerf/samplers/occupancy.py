@@ -15,6 +15,7 @@ from dnerf.samplers.visibility import joined, visible_samples
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
+MOST_AT_ONCE = 1 << 17  # samples that the filter asks, where many rays meet haze: about 100 MiB in the networks' layers
 SPACE = (1, 2, 3)  # axes
 NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no picture shows
 
@@ -221,7 +222,7 @@ class OccupancySampler(Sampler):
         asked, number = joined(samples, self.filter_joins)
         is_visible = visible_samples(
             asked, rays, field, self.min_weight,
-            first_round=FIRST_ROUND, pad_to=self.pad_to, observe=self.observe,
+            first_round=FIRST_ROUND, most_at_once=MOST_AT_ONCE, pad_to=self.pad_to, observe=self.observe,
         )  # fmt: skip
         marked = is_visible[number]
         kept = marked.nonzero()[:, 0]

@@ -16,7 +16,13 @@ Observer = Callable[[Tensor, Tensor, Tensor], None]
 
 @torch.no_grad()
 def walk_front_to_back(
-    source: Source, transmittance: Tensor, stop_transmittance: float, visit: Visitor, *, first_round: int = 8
+    source: Source,
+    transmittance: Tensor,
+    stop_transmittance: float,
+    visit: Visitor,
+    *,
+    first_round: int = 8,
+    most_at_once: int = 1 << 20,
 ) -> None:
     """Visit the samples of rays in rounds: the first few of each, twice as many, and so on, until it is opaque.
 
@@ -30,10 +36,12 @@ def walk_front_to_back(
         visit: called with the numbers (K,) of the rays that take part, their samples, and their transmittance (K,)
             before them; returns the share (K,) of light that passes them.
         first_round: samples per ray in the first round.
+        most_at_once: samples of all rays in a round (one of each ray at least); bounds the memory.
     """
     rays = torch.arange(len(transmittance), device=transmittance.device)
     taken, size = 0, first_round
     while len(rays):
+        size = max(1, min(size, most_at_once // len(rays)))
         part, has_more = source(rays, taken, size)
         before = transmittance[rays]
         after = before * visit(rays, part, before)
@@ -86,6 +94,7 @@ def visible_samples(
     min_weight: float,
     *,
     first_round: int = 8,
+    most_at_once: int = 1 << 20,
     pad_to: int = 1,
     observe: Observer | None = None,
 ) -> Tensor:
@@ -100,6 +109,7 @@ def visible_samples(
         field: whose density decides.
         min_weight: least weight that counts, in (0, 1).
         first_round: samples per ray in the first round, see `walk_front_to_back`.
+        most_at_once: samples of all rays in a round, likewise.
         pad_to: the field is asked a multiple of so many points.
         observe: told positions (n, 3), times (n,) and density (n,) of every round.
 
@@ -120,7 +130,9 @@ def visible_samples(
         marked[rounds.chosen] = weights[: len(rounds.chosen)] > min_weight
         return torch.exp(-sum_along_rays(optical_depth, part))
 
-    walk_front_to_back(rounds, samples.starts.new_ones(len(rays)), min_weight, visit, first_round=first_round)
+    walk_front_to_back(
+        rounds, torch.ones_like(rays.near), min_weight, visit, first_round=first_round, most_at_once=most_at_once
+    )
     return marked
 
 

@@ -71,17 +71,19 @@ def table_field(samples: Samples, values: Tensor) -> RadianceField:
     st.sampled_from([1e-6, 1e-4, 1e-2]),
     st.integers(1, 9),
     st.sampled_from([1, 16]),
+    st.sampled_from([1, 7, 1 << 20]),
 )
 def test_marks_are_those_of_a_loop_over_all_weights(
-    counts: list[int], seed: int, min_weight: float, first_round: int, pad_to: int
+    counts: list[int], seed: int, min_weight: float, first_round: int, pad_to: int, most_at_once: int
 ) -> None:
     """Whatever the rounds: kept is what has weight and lies where light still arrives."""
     rays, samples = packed(counts)
     draw = torch.Generator().manual_seed(seed)
     densities = 10 ** (torch.rand(sum(counts), generator=draw, dtype=torch.float64) * 8 - 5)
     marked = visible_samples(
-        samples, rays, table_field(samples, densities), min_weight, first_round=first_round, pad_to=pad_to
-    )
+        samples, rays, table_field(samples, densities), min_weight,
+        first_round=first_round, pad_to=pad_to, most_at_once=most_at_once,
+    )  # fmt: skip
     expected = []
     for values in densities.split(counts):
         expected += [weight > min_weight for weight in ray_weights([0.1 * v for v in values.tolist()])]
@@ -202,3 +204,18 @@ def test_a_filter_that_asks_for_pairs_keeps_what_matters_at_half_the_price() -> 
     # A pair is looked at in its middle: the surface's outermost interval can be missed where the middle is outside,
     # after which the next three of density 200 and length 0.02 still leave no more than exp(-12) of the light.
     assert (pictures[0] - pictures[1]).abs().mean() < 0.01
+
+
+def test_haze_is_asked_in_rounds_of_bounded_size() -> None:
+    sizes: list[int] = []
+
+    class Haze(FormulaField):
+        def density(self, positions: Tensor, times: Tensor) -> Tensor:
+            sizes.append(len(times))
+            return torch.full_like(times, 1e-3)
+
+    rays, samples = packed([50] * 30)
+    field = Haze(lambda x: x[..., 0], lambda x, d, t: x)
+    visible_samples(samples, rays, field, 1e-6, first_round=64, most_at_once=100)
+    assert sum(sizes) == 1500
+    assert max(sizes) <= 100
