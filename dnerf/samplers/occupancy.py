@@ -11,6 +11,7 @@ from dnerf.fields.base import RadianceField
 from dnerf.kernels import march, skip_distances
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
+from dnerf.samplers.masks import cube_corners, slab_halves, widened
 from dnerf.samplers.visibility import joined, visible_samples
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
@@ -204,7 +205,7 @@ class OccupancySampler(Sampler):
         num_slabs = len(occupied)
         slab = int(torch.tensor(time, dtype=camera.pose.dtype) * num_slabs)  # rounds as times of rays do
         lowest = occupied[min(slab, num_slabs - 1)].nonzero()
-        unit = (lowest[:, None] + _corners(lowest.device)) / self.shape[1:]
+        unit = (lowest[:, None] + cube_corners(lowest.device)) / self.shape[1:]
         return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
 
     @torch.no_grad()
@@ -286,11 +287,11 @@ class OccupancySampler(Sampler):
         """
         threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
         dense = self.maxima > threshold
-        occupied = _widened(_widened(dense, [0]), SPACE if self.margin else [])
+        occupied = widened(widened(dense, [0]), SPACE if self.margin else [])
         if is_filled or self.rendered is None:
             self._set(occupied, occupied.repeat_interleave(2, dim=0))
         else:
-            self._set(occupied, _widened(_halves(dense), SPACE if self.render_margin else []))
+            self._set(occupied, widened(slab_halves(dense), SPACE if self.render_margin else []))
 
     def _probe(self, field: RadianceField, cells: Tensor, within: Tensor) -> None:
         density = field.density(*self._within(cells, within))
@@ -318,11 +319,6 @@ class OccupancySampler(Sampler):
         _derive(self)
 
 
-def _corners(device: torch.device) -> Tensor:
-    """The corners (8, 3) of the unit cube."""
-    return torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
-
-
 def _derive(sampler: nn.Module, incompatible_keys: object = None) -> None:
     """Derive what is not saved from the occupied cells: a sampler's skips; their list on demand."""
     assert isinstance(sampler, OccupancySampler)
@@ -330,19 +326,3 @@ def _derive(sampler: nn.Module, incompatible_keys: object = None) -> None:
     sampler.skips.copy_(skip_distances(sampler.occupied))
     if sampler.rendered is not None and sampler.rendered_skips is not None:
         sampler.rendered_skips.copy_(skip_distances(sampler.rendered))
-
-
-def _widened(mask: Tensor, axes: Sequence[int]) -> Tensor:
-    """A mask and its neighbours on both sides along some axes."""
-    for axis in axes:
-        result, size = mask.clone(), mask.shape[axis] - 1
-        result.narrow(axis, 1, size).logical_or_(mask.narrow(axis, 0, size))
-        result.narrow(axis, 0, size).logical_or_(mask.narrow(axis, 1, size))
-        mask = result
-    return mask
-
-
-def _halves(mask: Tensor) -> Tensor:
-    """A mask (K, ...) for halves of its slabs (2 K, ...), each with the neighbour that is nearer in time."""
-    before, after = torch.cat([mask[:1], mask[:-1]]), torch.cat([mask[1:], mask[-1:]])
-    return torch.stack([mask | before, mask | after], dim=1).flatten(0, 1)

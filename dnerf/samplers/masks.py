@@ -1,0 +1,27 @@
+"""Masks of grid cells over time slabs and space."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def cube_corners(device: torch.device) -> Tensor:
+    """The corners (8, 3) of the unit cube."""
+    return torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
+
+
+def widened(mask: Tensor, axes: Sequence[int]) -> Tensor:
+    """A mask and its neighbours on both sides along some axes."""
+    for axis in axes:
+        result, size = mask.clone(), mask.shape[axis] - 1
+        result.narrow(axis, 1, size).logical_or_(mask.narrow(axis, 0, size))
+        result.narrow(axis, 0, size).logical_or_(mask.narrow(axis, 1, size))
+        mask = result
+    return mask
+
+
+def slab_halves(mask: Tensor) -> Tensor:
+    """A mask (K, ...) for halves of its slabs (2 K, ...), each with the neighbour that is nearer in time."""
+    before, after = torch.cat([mask[:1], mask[:-1]]), torch.cat([mask[1:], mask[-1:]])
+    return torch.stack([mask | before, mask | after], dim=1).flatten(0, 1)
