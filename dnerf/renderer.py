@@ -103,6 +103,7 @@ class Renderer(nn.Module):
         """What `forward` shows of a field, without per-sample data: rays end where they are opaque."""
         ends_early = self.stop_transmittance > 0 and self.quadrature == "constant"
         source = self._marched(rays) if ends_early else None
+        numbers = torch.arange(len(rays), device=rays.near.device)
         if source is None:
             with self.autocast(rays.origins.device):
                 samples = self.sampler(rays, field)
@@ -110,7 +111,8 @@ class Renderer(nn.Module):
                 return self._render(rays, samples, field)
             if not ends_early:
                 return self._render(rays, samples.padded(PAD_TO), field)
-            source = PackedRounds(samples, PAD_TO)
+            source = packed = PackedRounds(samples, PAD_TO)
+            numbers = packed.rays
         sums = rays.origins.new_zeros(len(rays), 5)
 
         def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
@@ -121,7 +123,7 @@ class Renderer(nn.Module):
             sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))
             return 1 - seen.opacity
 
-        walk_front_to_back(source, rays.near.new_ones(len(rays)), self.stop_transmittance, visit)
+        walk_front_to_back(source, numbers, self.stop_transmittance, visit)
         rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
         rgb = rgb + (1 - opacity)[:, None] * self.background(rays.directions)
         return Rendering(rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity))
@@ -167,14 +169,16 @@ class Renderer(nn.Module):
         field = self.field.finished() if pays else self.field
         if field is self.field:
             return self
-        return Renderer(
+        model = Renderer(
             field,
             self.sampler,
             self.background,
             precision=self.precision,
             stop_transmittance=self.stop_transmittance,
             quadrature=self.quadrature,
-        ).train(self.training)
+        )
+        model.training = self.training
+        return model
 
     @torch.no_grad()
     def render_image(self, camera: Camera, time: float, *, chunk: int = 16384) -> Rendering:

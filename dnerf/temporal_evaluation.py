@@ -119,7 +119,7 @@ def evaluate_over_time(
     """
     if num_frames < 3:
         raise ValueError(f"num_frames must be at least 3, got {num_frames}")
-    film = _shoot(renderer.for_sequence(num_frames), camera, [i / (num_frames - 1) for i in range(num_frames)], chunk)
+    film = _shoot(renderer, camera, [i / (num_frames - 1) for i in range(num_frames)], chunk)
     common: dict[str, Any] = {"num_frames": num_frames, "time_step": film.times[1], "flicker": flicker(film.pictures)}
     if scene is not None:
         return _against_exact(renderer, scene, film, common)

@@ -56,7 +56,10 @@ def main(config: DictConfig) -> None:
     frames = data.frames(config.path.get("split", "test"))
     views = _views(config, frames, device)
     chunk = config.chunk or saved.chunk
-    facts = {"model": _fingerprint(config.run), "outputs": outputs, "chunk": chunk, "device": device.type}
+    facts = {
+        "model": _fingerprint(config.run), "outputs": outputs, "chunk": chunk, "device": device.type,
+        "exact": config.exact,
+    }  # fmt: skip
     path = _output(config, formats)
     store = FrameStore(path.parent / f".{path.name}.{sequence_digest(views, facts)}", len(views))
     truth = _truth(data, frames, renderer, same_size=config.resolution is None) if "compare" in outputs else None
@@ -70,8 +73,9 @@ def main(config: DictConfig) -> None:
         print(f"{kept} of {len(views)} frames are there already")
     with tqdm(total=len(missing), unit="frame", disable=share.rank > 0, dynamic_ncols=True) as bar:
         render_frames_to(
-            store, renderer, views, outputs, truth=truth, chunk=chunk, share=share, on_frame=lambda _: bar.update()
-        )
+            store, renderer, views, outputs,
+            truth=truth, chunk=chunk, share=share, exact=config.exact, on_frame=lambda _: bar.update(),
+        )  # fmt: skip
     if share.size > 1:
         torch.distributed.barrier()
         torch.distributed.destroy_process_group()

@@ -12,6 +12,7 @@ from dnerf.cameras import Camera, Intrinsics, look_at
 from dnerf.compositing import FieldOutput, Rendering, composite
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, NeRFField, RadianceField
+from dnerf.rays import Rays, Samples
 from dnerf.renderer import Renderer
 from dnerf.samplers import ImportanceSampler, OccupancySampler, StratifiedSampler
 
@@ -286,6 +287,19 @@ def test_images_with_and_without_early_ends_agree_where_nothing_is_opaque() -> N
     )
     for name in ("rgb", "opacity", "depth"):
         torch.testing.assert_close(getattr(rounds, name), getattr(whole, name), rtol=0, atol=2e-6)
+
+
+def test_samplers_that_place_all_samples_at_once_end_early_too() -> None:
+    class AllAtOnce(OccupancySampler):
+        def first(self, rays: Rays, most: int) -> Samples | None:
+            return None
+
+    field, camera = CountingFog(100.0), some_camera(21, 17)
+    pictures = [
+        Renderer(field, sampler, stop_transmittance=1e-2).render_image(camera, 0.5)
+        for sampler in (OccupancySampler(BOX, 0.02), AllAtOnce(BOX, 0.02))
+    ]
+    torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("stop", [-0.1, 1.0, math.nan])

@@ -14,7 +14,7 @@ from dnerf.benchmarks.timing import time_in_turn
 from dnerf.data.frames import Frames
 from dnerf.deformations import FrameLattice
 from dnerf.fields import Baking, DeformedField
-from dnerf.renderer import Renderer
+from dnerf.renderer import FRAMES_THAT_SHARE, Renderer
 from dnerf.samplers import OccupancySampler
 
 PROBES = 2
@@ -75,7 +75,8 @@ def run(settings: Settings) -> SuiteResult:
             "grids are filled from the finished field (`OccupancySampler.fill`, random probes of every cell), so that "
             "their error is what a setting loses; `as trained` is the grid that training left behind, without its "
             "margin in space if the experiment renders so; `the experiment's own` adds its cut-off and the lattice of "
-            "its deformation, and for a sequence that of canonical space, filled before the clock starts. The "
+            "its deformation, and for a sequence that of canonical space, filled before the clock starts, unless haze "
+            "forbids it. The "
             f"reference samples the whole box at the trained step, {trained.step_size:g}, and leaves out nothing: "
             "errors are of pruning alone, not of the model. The experiment's own settings: threshold "
             f"{trained.threshold:g}, {int(trained.shape[1:].max())} cells, {int(trained.shape[0])} slabs, cut-off "
@@ -153,7 +154,8 @@ def _settings(
         yield Setting("cut-off", value, trained, value)
     for value in options["lattices"][few]:
         yield Setting("lattice", value, trained, 0.0, FrameLattice(trained.box.tolist(), value))
-    for value in options["bakings"][few]:
+    can_bake = isinstance(field, DeformedField) and field.canonical.is_fixed
+    for value in options["bakings"][few] if can_bake else []:
         yield Setting("baking", value, trained, 0.0, None, Baking(trained.box.tolist(), value))
 
 
@@ -161,13 +163,12 @@ def _using(renderer: Renderer, setting: Setting) -> Renderer:
     """A renderer of the same model with a setting."""
     field = renderer.field
     if isinstance(field, DeformedField):
-        field = DeformedField(
-            field.deformation, field.canonical, frame_lattice=setting.lattice, baking=setting.baking
-        ).finished()
+        field = DeformedField(field.deformation, field.canonical, frame_lattice=setting.lattice, baking=setting.baking)
     changed = Renderer(
-        field, setting.sampler, renderer.background, precision=renderer.precision, stop_transmittance=setting.cut
-    )
-    return changed.eval()
+        field if setting.knob in OWN else field.finished(), setting.sampler, renderer.background,
+        precision=renderer.precision, stop_transmittance=setting.cut, quadrature=renderer.quadrature,
+    )  # fmt: skip
+    return (changed.for_sequence(FRAMES_THAT_SHARE) if setting.knob == OWN[1] else changed).eval()
 
 
 def _pictures(renderer: Renderer, frames: Frames, chosen: list[int]) -> Tensor:

@@ -95,13 +95,14 @@ class FrozenDeformation(Deformation):
     def _fill(self, unit: Tensor) -> None:
         """Ask the deformation at the vertices of the points' cells that are not known yet."""
         size = torch.tensor(self.levels.cells, device=unit.device)
-        x, y, z = torch.minimum((unit * size).clamp_(min=0).long(), size - 1).unbind(-1)
+        # What is no number, or beyond those of a long, becomes the least long, and cell 0.
+        x, y, z = torch.minimum((unit * size).long().clamp_(min=0), size - 1).unbind(-1)
         rows, columns = self.is_filled.shape[1:]
-        known = self.is_filled.clone()
-        self.is_filled.view(-1).index_fill_(0, x.add(y.add(z, alpha=rows), alpha=columns), True)
-        if torch.equal(known, self.is_filled):
+        wanted = self.is_filled.clone()
+        wanted.view(-1).index_fill_(0, x.add(y.add(z, alpha=rows), alpha=columns), True)
+        if torch.equal(wanted, self.is_filled):
             return
-        needed = torch.nn.functional.pad(self.is_filled, (0, 1) * 3)
+        needed = torch.nn.functional.pad(wanted, (0, 1) * 3)
         for axis in range(3):
             length = needed.shape[axis] - 1
             needed.narrow(axis, 1, length).logical_or_(needed.narrow(axis, 0, length).clone())

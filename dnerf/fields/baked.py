@@ -1,5 +1,6 @@
 """A finished canonical field on a lattice of bricks: what frames of a sequence share is computed once."""
 
+import logging
 import math
 from collections.abc import Sequence
 
@@ -12,6 +13,8 @@ from dnerf.deformations.base import check_positions_times
 from dnerf.fields.base import RadianceField
 from dnerf.kernels import brick_lookup
 from dnerf.kernels.brick_lookup import BRICK, VERTICES
+
+logger = logging.getLogger(__name__)
 
 CHUNK = 32  # bricks asked at a time, always as many: matrix libraries compile code for every new number of rows
 FAINT = 1e-20  # density, in 1 / world unit, that stands for none: its logarithm is finite
@@ -26,9 +29,11 @@ class Baking:
     The field is exact at vertices, and the error falls with the square of the cells' size where it is smooth.
 
     Args:
-        box: (2, 3) corners of the lattice, in world units; outside it the field itself is asked.
+        box: (2, 3) corners of the space that the lattice covers, in world units; outside its bricks, which are whole,
+            the field itself is asked.
         resolution: cells along the box's longest side.
-        max_bricks: most bricks of 8 x 8 x 8 cells that are kept (12 KiB each); if more are needed, all are forgotten.
+        max_bricks: most bricks of 8 x 8 x 8 cells that are kept (12 KiB each); if more are needed, all are forgotten,
+            with a warning, since this costs more than it saves.
 
     Raises:
         ValueError: for a box that is none, or numbers that are not positive.
@@ -40,7 +45,8 @@ class Baking:
         self.box = as_box(box)
         sides = self.box[1] - self.box[0]
         self.cells_per_unit = resolution / float(sides.max())
-        self.shape = [math.ceil(round(float(s) * self.cells_per_unit / BRICK, 3)) for s in sides]
+        # Rounded, so that rounding of the sides adds no bricks.
+        self.shape = [max(1, math.ceil(round(float(s) * self.cells_per_unit / BRICK, 3))) for s in sides]
         self.max_bricks = max_bricks
 
     def bake(self, field: RadianceField) -> "BakedField":
@@ -74,8 +80,14 @@ class BakedField(RadianceField):
         self.cells_per_unit = baking.cells_per_unit
         self.max_bricks = baking.max_bricks
         self.num_bricks = 0
+        self.has_overflown = False
         self.slots = torch.full(baking.shape, -1)  # per brick of the box: its number, -1 if it does not exist
         self.bricks = torch.zeros(0, VERTICES, 4)  # at its vertices: the density's logarithm, rgb
+
+    @property
+    def is_fixed(self) -> bool:
+        """As the field it stands for."""
+        return True
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at positions (..., 3) and any times (...,)."""
@@ -87,7 +99,7 @@ class BakedField(RadianceField):
         check_positions_times(positions, times)
         self._to(positions.device)
         points = positions.reshape(-1, 3)
-        cells = (points - self.low.to(points.dtype)) * self.cells_per_unit
+        cells = ((points - self.low.to(points.dtype)) * self.cells_per_unit).to(self.bricks.dtype)
         values, is_known = self._values(cells)
         values = values.to(points.dtype)
         if not bool(is_known.all()):
@@ -103,6 +115,9 @@ class BakedField(RadianceField):
         if not len(missing):
             return found
         if self.num_bricks + len(missing) > self.max_bricks:
+            if not self.has_overflown:
+                logger.warning("baking: more than %d bricks are needed, frames take longer", self.max_bricks)
+            self.has_overflown = True
             self.slots.fill_(-1)
             self.num_bricks = 0
             missing = self._missing(cells)

@@ -29,7 +29,7 @@ class RadianceField(nn.Module, ABC):
 
     @property
     def is_fixed(self) -> bool:
-        """Whether density and colour depend on the position alone, not on time and direction."""
+        """Whether density and colour are known to depend on the position alone, not on time and direction."""
         return False
 
     def finished(self) -> "RadianceField":

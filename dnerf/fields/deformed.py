@@ -54,11 +54,16 @@ class DeformedField(RadianceField):
         if self.baking is None or not self.canonical.is_fixed:
             return self
         baked = self.baking.bake(self.canonical)
-        return DeformedField(self.deformation, baked, frame_lattice=self.frame_lattice).train(self.training)
+        return self._like(DeformedField(self.deformation, baked, frame_lattice=self.frame_lattice))
 
     def at_time(self, time: float) -> RadianceField:
         """The same with the deformation kept on the lattice, if there is one and anything moves."""
         if self.frame_lattice is None or isinstance(self.deformation, IdentityDeformation):
             return self
         frozen = self.frame_lattice.at_time(self.deformation, time)
-        return DeformedField(frozen, self.canonical).train(self.training)
+        return self._like(DeformedField(frozen, self.canonical))
+
+    def _like(self, field: "DeformedField") -> "DeformedField":
+        """Another field in this one's mode; its parts, which may be shared, keep theirs."""
+        field.training = self.training
+        return field

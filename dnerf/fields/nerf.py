@@ -59,6 +59,11 @@ class NeRFField(RadianceField):
         else:
             self.to_rgb = nn.Linear(hidden_features, 3)
 
+    @property
+    def is_fixed(self) -> bool:
+        """Whether colour does not depend on the direction; nothing depends on the time."""
+        return self.encode_directions is None
+
     def _density(self, features: Tensor) -> Tensor:
         return activate_density(self.to_density(features)[..., 0], self.density_activation, self.density_shift)
 

@@ -44,6 +44,8 @@ def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tens
 
 def brick_lookup_reference(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tensor, Tensor]:
     """The definition of `brick_lookup` in plain torch."""
+    if not len(bricks):
+        return bricks.new_zeros(len(positions), bricks.shape[2]), torch.zeros_like(positions[:, 0], dtype=torch.bool)
     shape = torch.tensor(slots.shape, device=slots.device)
     inside = ((positions >= 0) & (positions <= shape * BRICK)).all(-1)
     safe = torch.where(inside[:, None], positions, 0)

@@ -17,7 +17,7 @@ Observer = Callable[[Tensor, Tensor, Tensor], None]
 @torch.no_grad()
 def walk_front_to_back(
     source: Source,
-    transmittance: Tensor,
+    rays: Tensor,
     stop_transmittance: float,
     visit: Visitor,
     *,
@@ -31,23 +31,23 @@ def walk_front_to_back(
     Args:
         source: called with the numbers (K,) of rays, how many samples of each have been visited, and a size; returns
             at most so many further samples of each as packed samples of K rays, and which rays (K,) may have more.
-        transmittance: (R,) of all rays; ones that come to their end are multiplied in place.
+        rays: (R,) numbers of the rays that take part.
         stop_transmittance: a ray whose transmittance has fallen to this takes no further part.
         visit: called with the numbers (K,) of the rays that take part, their samples, and their transmittance (K,)
             before them; returns the share (K,) of light that passes them.
         first_round: samples per ray in the first round.
         most_at_once: samples of all rays in a round (one of each ray at least); bounds the memory.
     """
-    rays = torch.arange(len(transmittance), device=transmittance.device)
     taken, size = 0, first_round
+    before: Tensor | None = None
     while len(rays):
         size = max(1, min(size, most_at_once // len(rays)))
         part, has_more = source(rays, taken, size)
-        before = transmittance[rays]
+        before = part.starts.new_ones(len(rays)) if before is None else before
         after = before * visit(rays, part, before)
-        transmittance[rays] = after
         taken, size = taken + size, 2 * size
-        rays = rays[(after > stop_transmittance) & has_more]
+        goes_on = (after > stop_transmittance) & has_more
+        rays, before = rays[goes_on], after[goes_on]
 
 
 class PackedRounds:
@@ -58,13 +58,15 @@ class PackedRounds:
         pad_to: rounds are padded to a multiple of so many samples, see `Samples.padded`.
 
     Attributes:
-        chosen: (n,) numbers of the samples of the latest round.
+        rays: (K,) numbers of the rays that have samples.
+        chosen: (n,) numbers of the samples of the latest round, for visitors.
     """
 
     def __init__(self, samples: Samples, pad_to: int = 1) -> None:
         self.samples = samples
         self.pad_to = pad_to
         self.counts = samples.offsets.diff()
+        self.rays = self.counts.nonzero()[:, 0]
         self.chosen = torch.empty(0, dtype=torch.int64)
 
     def __call__(self, rays: Tensor, taken: int, size: int) -> tuple[Samples, Tensor]:
@@ -109,7 +111,7 @@ def visible_samples(
         field: whose density decides.
         min_weight: least weight that counts, in (0, 1).
         first_round: samples per ray in the first round, see `walk_front_to_back`.
-        most_at_once: samples of all rays in a round, likewise.
+        most_at_once: samples of all rays in a round, likewise; if there are no more, all may be one.
         pad_to: the field is asked a multiple of so many points.
         observe: told positions (n, 3), times (n,) and density (n,) of every round.
 
@@ -130,9 +132,11 @@ def visible_samples(
         marked[rounds.chosen] = weights[: len(rounds.chosen)] > min_weight
         return torch.exp(-sum_along_rays(optical_depth, part))
 
+    is_few = samples.starts.numel() <= most_at_once
     walk_front_to_back(
-        rounds, torch.ones_like(rays.near), min_weight, visit, first_round=first_round, most_at_once=most_at_once
-    )
+        rounds, rounds.rays, min_weight, visit,
+        first_round=first_round, most_at_once=first_round * len(rays) if is_few else most_at_once,
+    )  # fmt: skip
     return marked
 
 

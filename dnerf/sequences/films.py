@@ -55,6 +55,7 @@ def render_frames_to(
     truth: Truth | None = None,
     chunk: int = 16384,
     share: Share | None = None,
+    exact: bool = False,
     on_frame: Callable[[int], None] | None = None,
 ) -> int:
     """Render the frames that the store lacks, each written as soon as it is done.
@@ -67,6 +68,7 @@ def render_frames_to(
         truth: gives true pictures.
         chunk: rays at a time.
         share: this process's part; all frames if None.
+        exact: ask the field itself for every frame; otherwise see `Renderer.for_sequence`.
         on_frame: called with the index of every frame written.
 
     Returns:
@@ -80,7 +82,8 @@ def render_frames_to(
         raise ValueError(f"views must be {store.num_frames} as the store's frames, got {len(views)}")
     share = share or Share()
     missing = [i for i in store.missing() if share.mine(i)]
-    renderer = renderer.for_sequence(len(views))  # of all, so that a frame is the same whoever renders it
+    if not exact:
+        renderer = renderer.for_sequence(len(views))  # of all, so that a frame is the same whoever renders it
     for index in missing:
         following = views[index + 1] if index + 1 < len(views) else None
         store.write(index, render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk))

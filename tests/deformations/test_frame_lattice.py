@@ -107,3 +107,28 @@ def test_pictures_hardly_change_and_training_does_not_see_it(packed: bool) -> No
 def test_what_does_not_move_is_not_cached() -> None:
     field = DeformedField(IdentityDeformation(), GridField(BOX), frame_lattice=FrameLattice(BOX))
     assert field.at_time(0.5) is field
+
+
+def test_a_deformation_that_fails_once_is_asked_again() -> None:
+    class Failing(Bend):
+        fails = True
+
+        def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+            if self.fails:
+                self.fails = False
+                raise torch.OutOfMemoryError
+            return super().forward(positions, times)
+
+    x = points(50)
+    times = x.new_full((50,), 0.7)
+    frozen = FrameLattice(BOX, 16).at_time(Failing(), 0.7)
+    with pytest.raises(torch.OutOfMemoryError):
+        frozen(x, times)
+    assert torch.equal(frozen(x, times), FrameLattice(BOX, 16).at_time(Bend(), 0.7)(x, times))
+
+
+@pytest.mark.parametrize("strange", [float("inf"), -float("inf"), 1e30])
+def test_points_far_away_are_asked_of_the_deformation(strange: float) -> None:
+    x = torch.tensor([[0.1, 0.2, 0.3], [strange, 0.0, 0.0]], dtype=torch.float64)
+    moved = FrameLattice(BOX, 16).at_time(Bend(), 0.7)(x, x.new_full((2,), 0.7))
+    assert torch.equal(moved[1].nan_to_num(), Bend()(x, x.new_full((2,), 0.7))[1].nan_to_num())

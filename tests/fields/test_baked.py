@@ -1,5 +1,6 @@
 """The lattice of bricks that stands in for a finished canonical field."""
 
+import math
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from dnerf.cameras import Camera, Intrinsics, look_at
 from dnerf.compositing import FieldOutput
 from dnerf.deformations import DisplacementDeformation, FrameLattice
 from dnerf.fields import BakedField, Baking, DeformedField, GridField, RadianceField
+from dnerf.kernels import use_backend
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
 
@@ -142,13 +144,67 @@ def test_sequences_show_the_same_pictures() -> None:
     sampler.occupy(near)
     camera = Camera(Intrinsics.from_angle(24, 24, 0.7), look_at((3.0, 0.5, 1.0)), near=1.0, far=6.0)
     finished = renderer.for_sequence(60)
-    assert finished.field is not field
+    assert isinstance(finished.field, DeformedField)
+    assert isinstance(finished.field.canonical, BakedField)
+    assert finished.field.frame_lattice is field.frame_lattice
     assert renderer.for_sequence(2) is renderer
     for time in (0.0, 0.5, 0.0):
         exact, baked = renderer.render_image(camera, time), finished.render_image(camera, time)
         assert float(exact.opacity.max()) > 0.5
         # Kinks of 16 cells lie on vertices of 128, so only the head bends between these.
         torch.testing.assert_close(baked.rgb, exact.rgb, rtol=0, atol=5e-3)
+        assert not torch.equal(baked.rgb, exact.rgb)
+    num_bricks = finished.field.canonical.num_bricks
+    assert num_bricks > 10
+    finished.render_image(camera, 0.5)
+    assert finished.field.canonical.num_bricks == num_bricks
+
+
+def test_modes_of_shared_parts_are_left_alone() -> None:
+    field = DeformedField(DisplacementDeformation(1, 8, ()), GridField(BOX, (4,), 2), baking=Baking(BOX, 16))
+    sampler = OccupancySampler(BOX, 0.05)
+    sampler.occupy(torch.tensor(False))
+    renderer = Renderer(field, sampler).train()
+    sampler.eval()
+    finished = renderer.for_sequence(60)
+    assert finished is not renderer
+    assert finished.training
+    assert finished.field.training
+    assert not sampler.training
+    assert field.deformation.training
+
+
+def test_networks_in_bfloat16_are_baked_too() -> None:
+    torch.manual_seed(0)
+    field, x = GridField(BOX, (8, 16), 4, hidden_features=16, num_layers=1), points(300, dtype=torch.float32)
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        baked, exact = asked(Baking(BOX, 128).bake(field), x), asked(field, x)
+    assert baked.density.dtype == torch.float32
+    # bfloat16 keeps 8 bits of logarithms of size 1.
+    torch.testing.assert_close(baked.density, exact.density, rtol=2e-2, atol=0)
+    torch.testing.assert_close(baked.rgb, exact.rgb, rtol=0, atol=1e-2)
+
+
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_places_that_are_none_are_asked_of_the_field(backend: str) -> None:
+    x = torch.tensor([[0.0, 0.0, 0.0], [math.nan, 0.0, 0.0], [0.0, math.inf, 0.0]])
+    with use_backend(backend):
+        density = asked(Baking(BOX, 16).bake(Smooth()), x).density
+    assert density.isfinite().tolist() == [True, False, False]
+
+
+def test_room_that_does_not_suffice_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    baked = Baking(BOX, 64, max_bricks=3).bake(Smooth())
+    for seed in range(3):
+        asked(baked, points(20, seed))
+    assert [record.message for record in caplog.records if "more than 3 bricks" in record.message] == [
+        "baking: more than 3 bricks are needed, frames take longer"
+    ]
+
+
+def test_a_flat_box_has_a_brick() -> None:
+    flat = Baking([[0.0, 0.0, 0.0], [1.0, 1.0, 1e-5]], 16).bake(Smooth())
+    assert asked(flat, torch.zeros(2, 3)).density.isfinite().all()
 
 
 def test_a_renderer_that_keeps_nothing_renders_sequences_itself() -> None:

@@ -60,8 +60,6 @@ def test_all_bricks_together_are_a_dense_grid(reference):
 @given(st.tuples(*[st.integers(1, 4)] * 3), st.floats(0, 1), st.integers(1, 5), st.integers(0, 200), st.integers(0, 99))
 def test_numba_equals_reference(shape, share, num_features, count, seed):
     slots, bricks = lattice(shape, round(share * shape[0] * shape[1] * shape[2]), num_features, seed=seed)
-    if not len(bricks):
-        bricks = torch.zeros(1, VERTICES, num_features)
     positions = places(count, shape, seed)
     with kernels.use_backend("numba"):
         values, known = brick_lookup(positions, slots, bricks)
@@ -98,9 +96,12 @@ def test_what_is_no_place_is_not_known(compiled):
 
 def test_no_bricks_know_nothing(compiled):
     slots, bricks = torch.full((2, 2, 2), -1, device=compiled), torch.zeros(0, VERTICES, 4, device=compiled)
-    values, known = brick_lookup(torch.full((5, 3), 3.0, device=compiled), slots, bricks)
-    assert not known.any()
-    assert not values.any()
+    for look_up in (brick_lookup, brick_lookup_reference):
+        values, known = look_up(torch.full((5, 3), 3.0, device=compiled), slots, bricks)
+        assert values.shape == (5, 4)
+        assert known.shape == (5,)
+        assert not known.any()
+        assert not values.any()
 
 
 def test_op_is_registered_properly():
