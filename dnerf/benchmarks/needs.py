@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from dnerf.benchmarks.runs import Run, run_training
+from dnerf.benchmarks.runs import Run, run_training, warm_up
 from dnerf.benchmarks.scenes import scene_overrides
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 
@@ -114,6 +114,7 @@ def _trainer(settings: Settings, options: Mapping[str, Any]) -> Callable[[str, S
         *_base(options), *scene, f"trainer.max_seconds={options['seconds']}", "trainer.num_steps=1000000000",
         f"evaluate_frames={options['frames']}", f"evaluate_split={options['split']}", f"device={settings.device}",
     ]  # fmt: skip
+    warm_up(settings.train_command, common, settings.work_dir / "warm_up")
 
     def train(name: str, overrides: Sequence[str]) -> Trial:
         runs: list[Run] = []

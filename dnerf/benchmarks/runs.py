@@ -87,6 +87,21 @@ def run_training(command: Sequence[str], overrides: Sequence[str], folder: Path)
     return run
 
 
+def warm_up(command: Sequence[str], overrides: Sequence[str], folder: Path) -> None:
+    """Train for a moment and forget it: the first process after a change of kernels compiles them, in time and memory.
+
+    Args:
+        command: as of `run_training`.
+        overrides: likewise.
+        folder: of the run, deleted afterwards. What fails here fails in the first run, with a message.
+    """
+    folder = Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    few = ["trainer.num_steps=20", "trainer.progress_bar=false", "evaluate_frames=1"]
+    _watched([*command, *overrides, *few, f"out_dir={folder.resolve()}"], folder.with_suffix(".log"))
+    shutil.rmtree(folder, ignore_errors=True)
+
+
 def _watched(words: Sequence[str], log: Path) -> tuple[int, int]:
     """Run a command, output into a file; its exit code and the most bytes it held."""
     reader, writer = os.pipe()

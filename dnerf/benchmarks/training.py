@@ -3,7 +3,7 @@
 from statistics import fmean
 from typing import Any
 
-from dnerf.benchmarks.runs import Run, run_training
+from dnerf.benchmarks.runs import Run, run_training, warm_up
 from dnerf.benchmarks.scenes import scene_overrides
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 
@@ -16,6 +16,8 @@ def run(settings: Settings) -> SuiteResult:
     """Train every experiment on every scene for every budget and seed, one process after another."""
     options = {**settings.options, **(QUICK if settings.quick else {})}
     runs: dict[Key, list[Run]] = {}
+    first = options["scenes"][0], options["experiments"][0], options["seconds"][0], options["seeds"][0]
+    warm_up(settings.train_command, _overrides(settings, options, *first), settings.work_dir / "warm_up")
     rows = []
     for scene in options["scenes"]:
         for experiment in options["experiments"]:
@@ -45,16 +47,21 @@ def run(settings: Settings) -> SuiteResult:
 
 
 def _train(settings: Settings, options: dict[str, Any], scene: str, experiment: str, seconds: float, seed: int) -> Run:
+    folder = settings.work_dir / f"{scene}-{experiment}-{seconds:g}s-seed{seed}"
+    return run_training(settings.train_command, _overrides(settings, options, scene, experiment, seconds, seed), folder)
+
+
+def _overrides(
+    settings: Settings, options: dict[str, Any], scene: str, experiment: str, seconds: float, seed: int
+) -> list[str]:
     split = options["splits"].get(scene, "test")
     # The scene comes after the experiment, which may name one of its own.
-    overrides = [
+    return [
         f"experiment={experiment}",
         *scene_overrides(scene, options["resolution"], options["data_root"], settings.quick),
         f"trainer.max_seconds={seconds}", "trainer.num_steps=1000000000", f"seed={seed}", f"device={settings.device}",
         f"evaluate_split={split}", f"evaluate_frames={options['frames'].get(experiment, 'null')}",
     ]  # fmt: skip
-    folder = settings.work_dir / f"{scene}-{experiment}-{seconds:g}s-seed{seed}"
-    return run_training(settings.train_command, overrides, folder)
 
 
 def _mean_row(key: Key, runs: list[Run], options: dict[str, Any]) -> dict[str, Any]:

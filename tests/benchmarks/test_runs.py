@@ -74,7 +74,9 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     assert (row["psnr"], row["psnr_low"], row["psnr_high"], row["split"], row["frames"]) == (29, 28, 30, "val", 2)
     assert [p.name for p in result.plots] == ["training_walker", "training_static"]
     calls = (tmp_path / "work" / "calls.txt").read_text().splitlines()
-    assert len(calls) == 16
+    assert len(calls) == 17
+    assert "trainer.num_steps=20 " in calls[0]
+    assert not (tmp_path / "work" / "warm_up").exists()
     wanted = ("experiment=dnerf", "scene=static", "data.resolution=50", "evaluate_split=val", "evaluate_frames=2")
     assert all(word in calls[-1].split() for word in wanted)
 
