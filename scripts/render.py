@@ -42,6 +42,9 @@ def main(config: DictConfig) -> None:
     """Load the run, follow the path, render what is missing, write the films."""
     check_positive("num_frames", config.num_frames)
     check_positive("fps", config.fps)
+    for name in ("exact", "keep_frames"):
+        if not isinstance(config[name], bool):
+            raise ValueError(f"{name} must be true or false, got {config[name]!r}")
     outputs, formats = _listed(config.outputs), _listed(config.format)
     check_outputs(outputs)
     for format in formats:

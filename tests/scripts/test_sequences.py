@@ -221,6 +221,7 @@ def test_report_is_made_from_what_lies_in_the_run(work):
 
 
 WRONG = [
+    ("render", ("run=run", "exact=maybe"), "exact must be true or false, got 'maybe'"),
     ("render", ("run=run", "outputs=[sound]"), "outputs"),
     ("render", ("run=run", "outputs=[]"), "outputs"),
     ("render", ("run=run", "outputs=[compare]"), "compare"),
