@@ -155,3 +155,8 @@ def check_last_axis(name: str, value: Tensor, size: int) -> None:
     """
     if value.dim() == 0 or value.shape[-1] != size:
         raise ValueError(f"{name} must have shape (..., {size}), got {tuple(value.shape)}")
+
+
+def cube_corners(device: torch.device) -> Tensor:
+    """The corners (8, 3) of the unit cube, int64, z fastest."""
+    return torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)

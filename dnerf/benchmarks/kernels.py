@@ -11,6 +11,7 @@ from torch.nn.functional import embedding_bag
 from dnerf.benchmarks.machine import Rates, measure_rates
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import num_threads, time_in_turn
+from dnerf.geometry import cube_corners
 from dnerf.kernels import (
     GridLevels,
     brick_lookup,
@@ -139,8 +140,7 @@ class Workload:
 
     def _used_vertices(self) -> int:
         """Vertices of the bricks' lattice that the samples' cells have."""
-        corners = torch.cartesian_prod(*[torch.arange(2, device=self.cells.device)] * 3)
-        x, y, z = (self.cells.long()[:, None] + corners).unbind(-1)
+        x, y, z = (self.cells.long()[:, None] + cube_corners(self.cells.device)).unbind(-1)
         return int(torch.unique((x * (LATTICE + 1) + y) * (LATTICE + 1) + z).numel())
 
     def cases(self) -> list[Case]:

@@ -60,7 +60,6 @@ class FrozenDeformation(Deformation):
         self.low, self.sides = lattice.box[0], lattice.box[1] - lattice.box[0]
         self.displacements = torch.zeros(num_vertices, 4)  # four, so that rows are aligned
         self.is_known = torch.zeros([c + 1 for c in reversed(lattice.cells)], dtype=torch.bool)
-        self.is_filled = torch.zeros(list(reversed(lattice.cells)), dtype=torch.bool)  # cells with known vertices
 
     @torch.no_grad()
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
@@ -90,19 +89,15 @@ class FrozenDeformation(Deformation):
         if self.displacements.device != device:
             self.low, self.sides = self.low.to(device), self.sides.to(device)
             self.displacements, self.is_known = self.displacements.to(device), self.is_known.to(device)
-            self.is_filled = self.is_filled.to(device)
 
     def _fill(self, unit: Tensor) -> None:
         """Ask the deformation at the vertices of the points' cells that are not known yet."""
         size = torch.tensor(self.levels.cells, device=unit.device)
         # What is no number, or beyond those of a long, becomes the least long, and cell 0.
         x, y, z = torch.minimum((unit * size).long().clamp_(min=0), size - 1).unbind(-1)
-        rows, columns = self.is_filled.shape[1:]
-        wanted = self.is_filled.clone()
-        wanted.view(-1).index_fill_(0, x.add(y.add(z, alpha=rows), alpha=columns), True)
-        if torch.equal(wanted, self.is_filled):
-            return
-        needed = torch.nn.functional.pad(wanted, (0, 1) * 3)
+        needed = torch.zeros_like(self.is_known)
+        rows, columns = needed.shape[1:]
+        needed.view(-1).index_fill_(0, x.add(y.add(z, alpha=rows), alpha=columns), True)
         for axis in range(3):
             length = needed.shape[axis] - 1
             needed.narrow(axis, 1, length).logical_or_(needed.narrow(axis, 0, length).clone())

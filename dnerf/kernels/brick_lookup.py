@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from dnerf.geometry import cube_corners
+
 from .backend import choose, run_compiled
 
 # numba's cache on disk does not notice a change of these: touch the files that import them.
@@ -53,7 +55,7 @@ def brick_lookup_reference(positions: Tensor, slots: Tensor, bricks: Tensor) -> 
     number = slots[(cells // BRICK).unbind(-1)]
     known = inside & (number >= 0)
     fraction = (safe - cells)[:, None]
-    corners = torch.cartesian_prod(*[torch.arange(2, device=slots.device)] * 3)
+    corners = cube_corners(slots.device)
     weights = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
     x, y, z = (cells[:, None] % BRICK + corners).unbind(-1)
     side = BRICK + 1

@@ -6,11 +6,6 @@ import torch
 from torch import Tensor
 
 
-def cube_corners(device: torch.device) -> Tensor:
-    """The corners (8, 3) of the unit cube."""
-    return torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
-
-
 def widened(mask: Tensor, axes: Sequence[int]) -> Tensor:
     """A mask and its neighbours on both sides along some axes."""
     for axis in axes:

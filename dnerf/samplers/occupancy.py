@@ -8,10 +8,11 @@ from torch import Tensor, nn
 from dnerf.cameras import Camera
 from dnerf.checks import as_box, check_positive
 from dnerf.fields.base import RadianceField
+from dnerf.geometry import cube_corners
 from dnerf.kernels import march, skip_distances
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
-from dnerf.samplers.masks import cube_corners, slab_halves, widened
+from dnerf.samplers.masks import slab_halves, widened
 from dnerf.samplers.visibility import joined, visible_samples
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.

@@ -146,6 +146,16 @@ def test_broken_off_and_shared_renderings_give_the_same_bytes(tmp_path: Path) ->
     assert film(tmp_path / "shared", [Share(1, 2), Share(0, 2)]) == whole
 
 
+@pytest.mark.parametrize("exact", [False, True])
+def test_all_views_decide_what_frames_share_unless_all_is_to_be_exact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exact: bool
+) -> None:
+    renderer, views, asked = make_renderer(), some_views(3), []
+    monkeypatch.setattr(Renderer, "for_sequence", lambda own, count: asked.append(count) or own)
+    render_frames_to(FrameStore(tmp_path, 3), renderer, views, ["rgb"], share=Share(1, 2), exact=exact)
+    assert asked == ([] if exact else [3])
+
+
 KILLED = """
 import os, signal, sys
 from pathlib import Path
