@@ -51,8 +51,8 @@ def run(settings: Settings) -> SuiteResult:
             f"(`{' '.join(options['full'])}`), then with one part removed at a time, each trained for "
             f"{options['seconds']:g} s and scored on {options['frames']} unseen frames of {options['resolution']} x "
             f"{options['resolution']} pixels. All get the same time, so a part must earn what it costs. Parts whose "
-            f"removal loses at most {TOLERANCE} dB against the best are then removed together, and put back one by "
-            "one, the most valuable first, until the rest is within that of the best."
+            f"removal loses at most {TOLERANCE} dB against the best are then removed together; if that loses more, the "
+            "most valuable ones are put back, as few as a search by halves finds to be enough."
         ),
         tables=[
             Table(
@@ -88,6 +88,9 @@ def smallest_enough(
 ) -> tuple[list[str], Trial]:
     """Names of the parts that can go together, and what is left then.
 
+    Parts are put back in the order of what they are worth; how many must be is found by bisection, which takes for
+    granted that more parts are not worse.
+
     Args:
         full: scores with all parts.
         without: scores with one part removed.
@@ -96,12 +99,18 @@ def smallest_enough(
         enough: PSNR in dB that the result must reach; if nothing reaches it, all parts stay.
     """
     removed = sorted((name for name, t in without.items() if t.psnr >= enough), key=lambda n: without[n].psnr)
-    while len(removed) > 1:
-        together = trial(f"without {', '.join(removed)}", [o for name in removed for o in parts[name]])
+    if not removed:
+        return [], full
+    fewest, most, found = 0, len(removed) - 1, without[removed[-1]]
+    while fewest < most:
+        put_back = (fewest + most) // 2
+        gone = removed[put_back:]
+        together = trial(f"without {', '.join(gone)}", [o for name in gone for o in parts[name]])
         if together.psnr >= enough:
-            return removed, together
-        removed = removed[1:]
-    return removed, without[removed[0]] if removed else full
+            most, found = put_back, together
+        else:
+            fewest = put_back + 1
+    return removed[most:], found
 
 
 def _base(options: Mapping[str, Any]) -> list[str]:

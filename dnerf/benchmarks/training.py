@@ -36,6 +36,7 @@ def run(settings: Settings) -> SuiteResult:
             "compiling kernels left out, as the trainer counts), with learning rates that end with the budget, and is "
             f"then scored at {options['resolution']} x {options['resolution']} pixels on frames it has not seen. "
             "Memory is the most the process ever held, data, training and scoring together."
+            + "".join(f" `{name}` runs with `{' '.join(words)}`." for name, words in options["overrides"].items())
         ),
         tables=[
             Table("Means over seeds", means, "psnr_low, psnr_high: worst and best seed. frames: how many were scored."),
@@ -61,6 +62,7 @@ def _overrides(
         *scene_overrides(scene, options["resolution"], options["data_root"], settings.quick),
         f"trainer.max_seconds={seconds}", "trainer.num_steps=1000000000", f"seed={seed}", f"device={settings.device}",
         f"evaluate_split={split}", f"evaluate_frames={options['frames'].get(experiment, 'null')}",
+        *options["overrides"].get(experiment, []),
     ]  # fmt: skip
 
 

@@ -66,6 +66,7 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     options = {
         "scenes": ["walker", "static"], "experiments": ["fast", "dnerf"], "seconds": [4, 8], "seeds": [0, 2],
         "resolution": 50, "frames": {"dnerf": 2}, "splits": {"static": "val"}, "data_root": None,
+        "overrides": {"dnerf": ["trainer.num_rays=64"]},
     }  # fmt: skip
     result = run_training_suite(Settings(work_dir=tmp_path / "work", train_command=command, options=options))
     means = result.tables[0].rows
@@ -79,6 +80,10 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     assert not (tmp_path / "work" / "warm_up").exists()
     wanted = ("experiment=dnerf", "scene=static", "data.resolution=50", "evaluate_split=val", "evaluate_frames=2")
     assert all(word in calls[-1].split() for word in wanted)
+    with_few_rays = [call for call in calls if "trainer.num_rays=64" in call.split()]
+    assert len(with_few_rays) == 8
+    assert all("experiment=dnerf" in call.split() for call in with_few_rays)
+    assert "`dnerf` runs with `trainer.num_rays=64`" in result.summary
 
 
 def trial(psnr):
@@ -102,6 +107,22 @@ def test_parts_that_are_missed_together_are_put_back_the_most_valuable_first(tog
     assert names == removed
     assert smallest.psnr >= 29.9
     assert tried == [("without b, a", ["part=b", "part=a"])]
+
+
+@pytest.mark.parametrize("enough", [0.0, -0.5, -1.0, -2.5, -6.0, -100.0])
+def test_as_few_parts_as_needed_are_put_back_by_few_trainings(enough):
+    worth = {name: 0.25 * (8 - number) for number, name in enumerate("abcdefgh")}  # a is worth most
+    without = {name: trial(0.0) for name in worth}  # and nothing is missed alone
+    tried = []
+
+    def train(name, overrides):
+        tried.append(name)
+        return trial(-sum(worth[part] for part in overrides))
+
+    names, _ = smallest_enough(trial(0.0), without, {name: [name] for name in worth}, train, enough)
+    kept = [k for k in range(len(worth)) if -sum(list(worth.values())[k:]) >= enough]
+    assert names == list(worth)[min([*kept, len(worth) - 1]) :]
+    assert len(tried) <= 3  # log2(8)
 
 
 def test_all_parts_stay_if_each_is_missed():
