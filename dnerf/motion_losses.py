@@ -1,5 +1,5 @@
-"""Losses about motion, each optional: elastic for any deformation; for flows smooth, slow to change, volume-keeping,
-cycle-consistent.
+"""Losses about motion, each optional: elastic for any deformation, steady for what it carries; for flows smooth, slow
+to change, volume-keeping, cycle-consistent.
 
 They look at some of a batch's own samples, weighted by their share in the picture: motion of empty space is free.
 Derivatives in space and time are finite differences, since compiled kernels are differentiable once.
@@ -16,7 +16,7 @@ from torch import Tensor
 from dnerf.checks import check_positive
 from dnerf.compositing import Rendering
 from dnerf.deformations import Deformation, FlowDeformation, LatticeFlow, SkippingFlow
-from dnerf.fields import DeformedField
+from dnerf.fields import DeformedField, RadianceField
 from dnerf.losses import Loss
 from dnerf.renderer import Renderer
 
@@ -30,17 +30,19 @@ class MotionPoints:
 
     Args:
         positions: (M, 3) in world units, without gradient.
+        canonical: (M, 3) where the deformation put them, likewise.
         times: (M,).
         shares: (M,) summing to 1 (to 0 if the picture shows nothing), without gradient.
     """
 
     positions: Tensor
+    canonical: Tensor
     times: Tensor
     shares: Tensor
 
 
 class DeformationLoss(Loss):
-    """A term about a deformation, `weight` times the mean over points, weighted by their shares.
+    """A term about a deformation or what it carries, `weight` times the mean over points, weighted by their shares.
 
     Args:
         weight: factor of the term.
@@ -59,15 +61,16 @@ class DeformationLoss(Loss):
 
     def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
         """The weighted mean of `penalty`."""
-        deformation = self._deformation(renderer)
+        subject = self._subject(renderer)
         points = self._points(rendering)
-        return self.weight * (points.shares * self.penalty(deformation, points)).sum()
+        return self.weight * (points.shares * self.penalty(subject, points)).sum()
 
     @abstractmethod
-    def penalty(self, deformation: Any, points: MotionPoints) -> Tensor:
+    def penalty(self, subject: Any, points: MotionPoints) -> Tensor:
         """What is wrong at each point, (M,)."""
 
-    def _deformation(self, renderer: Renderer) -> Deformation:
+    def _subject(self, renderer: Renderer) -> Any:
+        """What is judged: the deformation."""
         if not isinstance(renderer.field, DeformedField):
             raise ValueError(f"{type(self).__name__} needs a deformed field, got {type(renderer.field).__name__}")
         return renderer.field.deformation
@@ -75,11 +78,15 @@ class DeformationLoss(Loss):
     def _points(self, rendering: Rendering) -> MotionPoints:
         assert rendering.output is not None
         assert rendering.weights is not None
-        positions = rendering.output.extras["positions"].detach().reshape(-1, 3)
-        every = max(1, -(-len(positions) // self.num_points))
+        extras = rendering.output.extras
+        every = max(1, -(-extras["times"].numel() // self.num_points))
         weights = rendering.weights.detach().reshape(-1)[::every]
-        shares = weights / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny)
-        return MotionPoints(positions[::every], rendering.output.extras["times"].reshape(-1)[::every], shares)
+        return MotionPoints(
+            positions=extras["positions"].detach().reshape(-1, 3)[::every],
+            canonical=extras["canonical_positions"].detach().reshape(-1, 3)[::every],
+            times=extras["times"].reshape(-1)[::every],
+            shares=weights / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny),
+        )
 
 
 class ElasticLoss(DeformationLoss):
@@ -114,6 +121,49 @@ class ElasticLoss(DeformationLoss):
         return (0.5 * torch.log(squared + LEAST_STRETCH**2)).square()
 
 
+class SteadyMatterLoss(DeformationLoss):
+    """Squared change of matter that is carried along: of its opacity and colour, between a ray's time and another.
+
+    For a canonical field that may change with time: `(a(t) - a(t'))^2 + |rgb(t) - rgb(t')|^2` with a the opacity
+    `1 - exp(-density length)`, t a sample's time and t' any other. What changes in canonical space can explain by
+    itself whatever motion would, so motion is found only if change has a price. No gradient reaches the deformation.
+
+    Args:
+        weight: factor of the term.
+        num_points: see `DeformationLoss`.
+        length: of the intervals whose opacity is meant, in world units.
+
+    Raises:
+        ValueError: as `DeformationLoss`, and for a length that is not positive.
+    """
+
+    def __init__(self, weight: float = 3e-4, num_points: int = 512, *, length: float = 0.02) -> None:
+        super().__init__(weight, num_points)
+        check_positive("length", length)
+        self.length = length
+
+    def penalty(self, canonical: RadianceField, points: MotionPoints) -> Tensor:
+        """Squared change of opacity and of the three colours, each seen from some direction."""
+        numbers = torch.arange(len(points.times), dtype=points.times.dtype, device=points.times.device)
+        # Spread evenly over all times, whatever the points' directions are.
+        others = (points.times + (math.sqrt(2) - 1) * (numbers + 0.5)) % 1
+        if canonical.num_contents:
+            contents = canonical.contents(points.canonical)
+            outputs = [canonical.from_contents(contents, times) for times in (points.times, others)]
+        else:
+            views = spread_directions(points.canonical)
+            outputs = [canonical(points.canonical, views, times) for times in (points.times, others)]
+        here, there = (
+            torch.cat([-torch.expm1(-self.length * output.density)[:, None], output.rgb], dim=-1) for output in outputs
+        )
+        return (here - there).square().sum(-1)
+
+    def _subject(self, renderer: Renderer) -> RadianceField:
+        super()._subject(renderer)
+        assert isinstance(renderer.field, DeformedField)
+        return renderer.field.canonical
+
+
 class MotionLoss(DeformationLoss):
     """A term about the motion of a flow.
 
@@ -125,7 +175,7 @@ class MotionLoss(DeformationLoss):
         ValueError: as `DeformationLoss`, and when used, for a renderer whose deformation is no flow.
     """
 
-    def _deformation(self, renderer: Renderer) -> FlowDeformation:
+    def _subject(self, renderer: Renderer) -> FlowDeformation:
         deformation = renderer.field.deformation if isinstance(renderer.field, DeformedField) else None
         if isinstance(deformation, LatticeFlow | SkippingFlow):
             deformation = deformation.flow

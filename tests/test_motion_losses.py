@@ -8,13 +8,14 @@ from dnerf.benchmarks.closed_flows import Expansion, Rotation, Shear
 from dnerf.compositing import FieldOutput, Rendering
 from dnerf.deformations import Deformation, DisplacementDeformation, FlowDeformation, LatticeFlow
 from dnerf.deformations.velocities import NetworkVelocity, Velocity
-from dnerf.fields import DeformedField
+from dnerf.fields import DeformedField, GridField, RadianceField
 from dnerf.motion_losses import (
     AccelerationLoss,
     CycleConsistencyLoss,
     DivergenceLoss,
     ElasticLoss,
     SmoothVelocityLoss,
+    SteadyMatterLoss,
     spread_directions,
 )
 from dnerf.renderer import Renderer
@@ -118,6 +119,60 @@ def test_directions_are_spread_evenly() -> None:
     assert spread_directions(torch.zeros(0, 3)).shape == (0, 3)
 
 
+class Changing(RadianceField):
+    """Matter whose opacity over a length of 0.1 is `opacity t` and whose red is `red t`, from 0 at time 0."""
+
+    def __init__(self, opacity: float, red: float) -> None:
+        super().__init__()
+        self.strength = torch.nn.Parameter(torch.tensor([opacity, red], dtype=torch.float64))
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        return -torch.log1p(-self.strength[0] * times) / 0.1
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        red = (self.strength[1] * times)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+        return FieldOutput(self.density(positions, times), red)
+
+
+def steady(canonical: RadianceField, count: int = 5000) -> Tensor:
+    renderer = Renderer(DeformedField(Linear(torch.eye(3)), canonical), StratifiedSampler(4))
+    return SteadyMatterLoss(1.0, count, length=0.1)(rendering(count), torch.zeros(8, 3), renderer)
+
+
+@pytest.mark.parametrize("options", [{"time_terms": 3}, {"time_terms": 3, "view_degree": 1}, {"time_frequencies": 2}])
+def test_change_has_a_price_and_steady_matter_none(options: dict) -> None:
+    grid = GridField([[-1.0] * 3, [1.0] * 3], (4,), 2, density_shift=3.0, **options).double()
+    begins_steady = "time_terms" in options
+    assert (steady(grid).item() < 1e-20) == begins_steady
+    torch.nn.init.normal_(grid.head.output.weight)
+    torch.nn.init.normal_(grid.head.output.bias)
+    loss = steady(grid)
+    loss.backward()
+    assert loss.item() > 1e-3
+    assert grid.table.grad.abs().max() > 0
+
+
+def test_change_costs_the_mean_square_between_two_random_times() -> None:
+    """E (t - t')^2 = 1 / 6 for two even times, so the gradient by a strength s is s / 3. Points' shares are random."""
+    canonical = Changing(0.6, 0.9)
+    loss = steady(canonical)
+    assert loss.item() == pytest.approx((0.6**2 + 0.9**2) / 6, rel=0.05)
+    loss.backward()
+    torch.testing.assert_close(canonical.strength.grad, canonical.strength.detach() / 3, rtol=0.05, atol=0)
+
+
+def test_the_price_of_change_does_not_move_anything() -> None:
+    deformation = Linear(torch.eye(3, dtype=torch.float64))
+    picture, renderer = rendering(), Renderer(DeformedField(deformation, Changing(0.6, 0.9)), StratifiedSampler(4))
+    picture.output.extras["canonical_positions"] = deformation(picture.output.extras["positions"], torch.zeros(64))
+    SteadyMatterLoss(1.0)(picture, torch.zeros(8, 3), renderer).backward()
+    assert deformation.matrix.grad is None
+    picture.weights.zero_()
+    assert SteadyMatterLoss(1.0)(picture, torch.zeros(8, 3), renderer) == 0
+    with pytest.raises(ValueError, match="SteadyMatterLoss needs a deformed field, got "):
+        SteadyMatterLoss()(picture, torch.zeros(8, 3), Renderer(Changing(0.6, 0.9), StratifiedSampler(4)))
+
+
 def test_acceleration_of_a_rotation_is_centripetal() -> None:
     picture = rendering()
     loss = AccelerationLoss(1.0, interval=0.02)(picture, torch.zeros(8, 3), renderer_of(Rotation(2.0), num_steps=64))
@@ -203,6 +258,7 @@ def test_a_field_without_deformation_is_named() -> None:
     ("make", "message"),
     [
         (lambda: ElasticLoss(distance=0.0), "distance must be > 0"),
+        (lambda: SteadyMatterLoss(length=0.0), "length must be > 0"),
         (lambda: SmoothVelocityLoss(-1.0), "weight must be >= 0"),
         (lambda: DivergenceLoss(1.0, 0), "num_points must be > 0"),
         (lambda: AccelerationLoss(interval=0.6), r"interval must be in \(0, 0\.5\]"),

@@ -34,6 +34,7 @@ NUM_FEATURES = 8
 MAX_ROWS = 1 << 17
 STEP = 0.03
 LATTICE = 384  # cells per side of the bricks' lattice
+CONTENTS = 16  # numbers of each of its vertices
 ALONE = ("march", "brick_lookup")  # have no quicker form in plain torch than their definition
 
 Call = Callable[[], Any]
@@ -126,7 +127,7 @@ class Workload:
         self.slots[needed.unbind(-1)] = 0
         places = (self.slots == 0).nonzero()
         self.slots[places.unbind(-1)] = torch.arange(len(places), device=device)
-        self.bricks = torch.randn(len(places), VERTICES, 4, generator=generator).to(device)
+        self.bricks = torch.randn(len(places), VERTICES, CONTENTS, generator=generator).to(device)
         self.depth = torch.rand(self.num_samples, generator=generator).to(device)
         self.values = torch.rand(self.num_samples, 5, generator=generator).to(device)
         self.weights = packed_weights(self.depth, self.marched.offsets)
@@ -158,7 +159,7 @@ class Workload:
                 "brick_lookup",
                 "forward",
                 _backends(lambda: brick_lookup(self.cells, self.slots, self.bricks)),
-                (3 * 4 + 4 * 4 + 1) * self.num_samples + 16 * self._used_vertices(),
+                (4 * (3 + CONTENTS) + 1) * self.num_samples + 4 * CONTENTS * self._used_vertices(),
             ),
             *_both(
                 "grid_encode",

@@ -154,7 +154,7 @@ def _settings(
         yield Setting("cut-off", value, trained, value)
     for value in options["lattices"][few]:
         yield Setting("lattice", value, trained, 0.0, FrameLattice(trained.box.tolist(), value))
-    can_bake = isinstance(field, DeformedField) and field.canonical.is_fixed
+    can_bake = isinstance(field, DeformedField) and field.canonical.num_contents > 0
     for value in options["bakings"][few] if can_bake else []:
         yield Setting("baking", value, trained, 0.0, None, Baking(trained.box.tolist(), value))
 

@@ -17,14 +17,13 @@ from dnerf.kernels.brick_lookup import BRICK, VERTICES
 logger = logging.getLogger(__name__)
 
 CHUNK = 32  # bricks asked at a time, always as many: matrix libraries compile code for every new number of rows
-FAINT = 1e-20  # density, in 1 / world unit, that stands for none: its logarithm is finite
 
 
 class Baking:
     """The geometry of lattices that stand in for a finished canonical field.
 
-    Every frame of a sequence looks at the same canonical matter. Logarithms of density and colours at the vertices of
-    a fine lattice, interpolated linearly, cost one lookup; a multi-resolution grid costs one per level, and a network.
+    Every frame of a sequence looks at the same canonical matter. The field's contents at the vertices of a fine
+    lattice, interpolated linearly, cost one lookup; a multi-resolution grid costs one per level, and a network.
     Vertices are computed when a sample first falls near them, brick by brick, so that only what is looked at exists.
     The field is exact at vertices, and the error falls with the square of the cells' size where it is smooth.
 
@@ -32,14 +31,15 @@ class Baking:
         box: (2, 3) corners of the space that the lattice covers, in world units; outside its bricks, which are whole,
             the field itself is asked.
         resolution: cells along the box's longest side.
-        max_bricks: most bricks of 8 x 8 x 8 cells that are kept (12 KiB each); if more are needed, all are forgotten,
-            with a warning, since this costs more than it saves.
+        max_bricks: most bricks of 8 x 8 x 8 cells that are kept, of 2.9 KiB for each number of a field's contents (46
+            KiB each and 364 MiB in all for 16); if more are needed, all are forgotten, with a warning, since this
+            costs more than it saves.
 
     Raises:
         ValueError: for a box that is none, or numbers that are not positive.
     """
 
-    def __init__(self, box: Sequence[Sequence[float]], resolution: int = 384, *, max_bricks: int = 1 << 14) -> None:
+    def __init__(self, box: Sequence[Sequence[float]], resolution: int = 384, *, max_bricks: int = 1 << 13) -> None:
         check_positive("resolution", resolution)
         check_positive("max_bricks", max_bricks)
         self.box = as_box(box)
@@ -53,7 +53,7 @@ class Baking:
         """A stand-in for a field that nothing changes any more.
 
         Raises:
-            ValueError: if the field depends on more than the position.
+            ValueError: if the field has no contents that could be kept.
         """
         return BakedField(field, self)
 
@@ -64,17 +64,17 @@ class BakedField(RadianceField):
     For rendering: it knows nothing of later changes of the field, and no gradient reaches it.
 
     Args:
-        field: what is asked at vertices; it may depend on nothing but the position.
-        baking: where they are.
+        field: whose contents are kept.
+        baking: the vertices.
 
     Raises:
-        ValueError: if the field depends on more than the position.
+        ValueError: if the field has no contents that could be kept.
     """
 
     def __init__(self, field: RadianceField, baking: Baking) -> None:
         super().__init__()
-        if not field.is_fixed:
-            raise ValueError("field must depend on the position alone, got one that depends on time or direction")
+        if not field.num_contents:
+            raise ValueError(f"field must have contents to keep, got a {type(field).__name__} without")
         self.field = field
         self.low = baking.box[0]
         self.cells_per_unit = baking.cells_per_unit
@@ -82,21 +82,31 @@ class BakedField(RadianceField):
         self.num_bricks = 0
         self.has_overflown = False
         self.slots = torch.full(baking.shape, -1)  # per brick of the box: its number, -1 if it does not exist
-        self.bricks = torch.zeros(0, VERTICES, 4)  # at its vertices: the density's logarithm, rgb
+        self.bricks = torch.zeros(0, VERTICES, field.num_contents)  # at its vertices
 
     @property
-    def is_fixed(self) -> bool:
+    def num_contents(self) -> int:
+        """As of the field it stands for."""
+        return self.field.num_contents
+
+    def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
         """As the field it stands for."""
-        return True
+        return self.field.from_contents(contents, times)
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Density (...,) at positions (..., 3) and any times (...,)."""
+        """Density (...,) at positions (..., 3) and times (...,)."""
         return self(positions, positions, times).density
 
     @torch.no_grad()
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
-        """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and times (...,)."""
+        """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and at times (...,)."""
         check_positions_times(positions, times)
+        times = times.reshape(-1)[0] if times.numel() and bool((times == times.reshape(-1)[0]).all()) else times
+        return self.from_contents(self.contents(positions), times)
+
+    @torch.no_grad()
+    def contents(self, positions: Tensor) -> Tensor:
+        """Interpolated contents (..., C) at positions (..., 3), in their dtype."""
         self._to(positions.device)
         points = positions.reshape(-1, 3)
         cells = ((points - self.low.to(points.dtype)) * self.cells_per_unit).to(self.bricks.dtype)
@@ -104,12 +114,11 @@ class BakedField(RadianceField):
         values = values.to(points.dtype)
         if not bool(is_known.all()):
             rest = (~is_known).nonzero()[:, 0]
-            values[rest] = self._ask(points[rest]).to(points.dtype)
-        values = values.reshape(*positions.shape[:-1], 4)
-        return FieldOutput(density=values[..., 0].exp(), rgb=values[..., 1:])
+            values[rest] = self.field.contents(points[rest]).to(points.dtype)
+        return values.reshape(*positions.shape[:-1], values.shape[-1])
 
     def _values(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (N, 4) at places (N, 3) in cells, and whether they are in the box (N,)."""
+        """Values (N, C) at places (N, 3) in cells, and whether they are in the box (N,)."""
         found = brick_lookup(cells, self.slots, self.bricks)
         missing = self._missing(cells[~found[1]])
         if not len(missing):
@@ -126,10 +135,6 @@ class BakedField(RadianceField):
                 return torch.cat([h[0] for h in halves]), torch.cat([h[1] for h in halves])
         self._make(missing)
         return brick_lookup(cells, self.slots, self.bricks)
-
-    def _ask(self, points: Tensor) -> Tensor:
-        output = self.field(points, torch.zeros_like(points), points.new_zeros(len(points)))
-        return torch.cat([output.density.clamp(min=FAINT).log()[:, None], output.rgb.to(output.density.dtype)], dim=-1)
 
     def _to(self, device: torch.device) -> None:
         if self.slots.device != device:
@@ -152,7 +157,7 @@ class BakedField(RadianceField):
         for part, number in zip((missing * BRICK).split(CHUNK), numbers.split(CHUNK), strict=True):
             asked = torch.cat([part, part[-1:].expand(CHUNK - len(part), 3)])
             points = self.low + (asked[:, None] + vertices).reshape(-1, 3) / self.cells_per_unit
-            values = self._ask(points).to(self.bricks.dtype).reshape(CHUNK, VERTICES, 4)
+            values = self.field.contents(points).to(self.bricks.dtype).reshape(CHUNK, VERTICES, -1)
             self.bricks[number] = values[: len(part)]
         self.slots[missing.unbind(-1)] = numbers
         self.num_bricks = end
@@ -161,5 +166,7 @@ class BakedField(RadianceField):
         """Room for so many bricks; if there was less, for twice as many as before at least."""
         held = len(self.bricks)
         if count > held:
-            more = min(max(count, 2 * held), self.max_bricks) - held
-            self.bricks = torch.cat([self.bricks, self.bricks.new_zeros(more, VERTICES, 4)])
+            room = min(max(count, 2 * held), self.max_bricks)
+            bricks = self.bricks.new_empty(room, *self.bricks.shape[1:])
+            bricks[:held] = self.bricks
+            self.bricks = bricks

@@ -27,10 +27,36 @@ class RadianceField(nn.Module, ABC):
             `FieldOutput` with density (...,) and rgb (..., 3) in [0, 1].
         """
 
+    def _check_contents(self, contents: Tensor, times: Tensor) -> None:
+        if not self.num_contents:
+            RadianceField.contents(self, contents)
+        if contents.shape[-1:] != (self.num_contents,):
+            raise ValueError(f"contents must have shape (..., {self.num_contents}), got {tuple(contents.shape)}")
+        if times.ndim and times.shape != contents.shape[:-1]:
+            raise ValueError(
+                f"times must have shape () or {tuple(contents.shape[:-1])} as the contents, got {tuple(times.shape)}"
+            )
+
     @property
-    def is_fixed(self) -> bool:
-        """Whether density and colour are known to depend on the position alone, not on time and direction."""
-        return False
+    def num_contents(self) -> int:
+        """How many numbers say all about a place, see `contents`; 0 if none do, as where directions matter."""
+        return 0
+
+    def contents(self, positions: Tensor) -> Tensor:
+        """All that the field knows of positions (..., 3): numbers (..., C), about linear where the field is smooth.
+
+        Raises:
+            ValueError: for a field without such numbers (`num_contents` is 0), or positions of another shape.
+        """
+        raise ValueError(f"{type(self).__name__} has no contents that say all about a place (num_contents is 0)")
+
+    def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
+        """What `forward` says of places, from their contents (..., C), at times (...,) or one time () for all.
+
+        Raises:
+            ValueError: for a field without contents, or shapes that do not fit.
+        """
+        raise ValueError(f"{type(self).__name__} has no contents that say all about a place (num_contents is 0)")
 
     def finished(self) -> "RadianceField":
         """The field to ask once nothing is learnt any more; itself, unless something can be kept between frames."""

@@ -20,8 +20,8 @@ class DeformedField(RadianceField):
         deformation: world -> canonical.
         canonical: field in canonical space; it may use the time as well.
         frame_lattice: where frames see the deformation through a lattice; None for frames that ask it at every sample.
-        baking: how a finished canonical field is kept for the frames of a sequence, if it depends on the position
-            alone; None for frames that ask it at every sample.
+        baking: how the contents of a finished canonical field are kept for the frames of a sequence, if it has any;
+            None for frames that ask it at every sample.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class DeformedField(RadianceField):
 
     def finished(self) -> RadianceField:
         """The same with the canonical field baked, if that is wanted and can be done."""
-        if self.baking is None or not self.canonical.is_fixed:
+        if self.baking is None or not self.canonical.num_contents:
             return self
         baked = self.baking.bake(self.canonical)
         return self._like(DeformedField(self.deformation, baked, frame_lattice=self.frame_lattice))

@@ -12,6 +12,7 @@ from dnerf.deformations.base import check_positions_times
 from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField
+from dnerf.geometry import check_last_axis
 from dnerf.kernels import GridLevels, grid_encode
 from dnerf.mlp import MLP
 
@@ -21,7 +22,7 @@ class GridField(RadianceField):
 
     Source: instant-ngp (Mueller et al. 2022): levels are dense while their vertices fit into `max_rows` rows and
     hashed beyond. Cells are cubes: a resolution counts cells along the box's longest side. Parts a scene does not
-    need do not exist: no time features without `time_frequencies`, no directions without `view_degree`.
+    need do not exist: no change with time without `time_terms`, no directions without `view_degree`.
 
     Args:
         box: (2, 3) corners of the modelled space; positions outside see the features of the nearest face.
@@ -30,8 +31,10 @@ class GridField(RadianceField):
         max_rows: most table rows of a level, a power of two.
         hidden_features: width of the head.
         num_layers: hidden layers of the head.
-        time_frequencies: octaves of a time encoding that the head sees (shading and topology that change); None for
-            a field that does not depend on time.
+        time_frequencies: octaves of a time encoding that the head sees; None for a head that does not depend on time.
+        time_terms: terms K of a cosine series in time, cos(k pi t) for k < K, that density and colour follow before
+            their activations: folds and shading that change while matter moves. 1 for matter that is carried along
+            and never changes.
         view_degree: spherical-harmonics degree of the direction that a second, colour-only head sees; None for matte.
         density_activation: "softplus" or "exp".
         density_shift: added before the activation; negative for a thin start.
@@ -53,6 +56,7 @@ class GridField(RadianceField):
         hidden_features: int = 64,
         num_layers: int = 2,
         time_frequencies: int | None = None,
+        time_terms: int = 1,
         view_degree: int | None = None,
         density_activation: str = "exp",
         density_shift: float = -1.0,
@@ -60,6 +64,7 @@ class GridField(RadianceField):
     ) -> None:
         super().__init__()
         check_positive("num_features", num_features)
+        check_positive("time_terms", time_terms)
         if window_end is not None and not 0 < window_end <= 1:
             raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
         corners = as_box(box)
@@ -79,19 +84,26 @@ class GridField(RadianceField):
         self.table = nn.Parameter(torch.empty(self.levels.num_rows, num_features).uniform_(-1e-2, 1e-2))
         self.encode_times = None if time_frequencies is None else SinusoidalEncoding(1, time_frequencies)
         self.encode_directions = None if view_degree is None else SphericalHarmonicsEncoding(view_degree)
+        self.time_terms = time_terms
+        self.register_buffer("orders", torch.arange(time_terms), persistent=False)
+        self.orders: Tensor
         in_features = num_features * self.levels.num_levels
         if self.encode_times is not None:
             in_features += self.encode_times.out_features
         if self.encode_directions is None:
-            self.head = MLP(in_features, hidden_features, num_layers, out_features=4)
+            self.head = MLP(in_features, hidden_features, num_layers, out_features=4 * time_terms)
+            _begin_constant(self.head, 4, time_terms)
         else:
-            self.head = MLP(in_features, hidden_features, num_layers, out_features=1 + hidden_features)
-            self.to_rgb = MLP(hidden_features + self.encode_directions.out_features, hidden_features, 1, out_features=3)
+            self.head = MLP(in_features, hidden_features, num_layers, out_features=time_terms + hidden_features)
+            _begin_constant(self.head, 1, time_terms)
+            in_colors = hidden_features + self.encode_directions.out_features
+            self.to_rgb = MLP(in_colors, hidden_features, 1, out_features=3 * time_terms)
+            _begin_constant(self.to_rgb, 3, time_terms)
 
     @property
-    def is_fixed(self) -> bool:
-        """Whether the head sees neither times nor directions."""
-        return self.encode_times is None and self.encode_directions is None
+    def num_contents(self) -> int:
+        """The head's outputs; none if it sees times or directions."""
+        return 4 * self.time_terms if self.encode_times is None and self.encode_directions is None else 0
 
     def set_progress(self, progress: float) -> None:
         """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
@@ -101,30 +113,69 @@ class GridField(RadianceField):
         opened = (len(levels) - 1) * min(progress / self.window_end, 1.0) - levels + 1
         self.window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))
 
-    def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
-        check_positions_times(positions, times)
+    def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
         unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
         features = grid_encode(unit.reshape(-1, 3), self.table, self.levels)
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
         if self.window_end is not None:
             features = features * self.window.repeat_interleave(self.table.shape[1]).to(features.dtype)
         if self.encode_times is not None:
+            assert times is not None
             features = torch.cat([features, self.encode_times(times[..., None])], dim=-1)
         return self.head(features)
 
-    def _density(self, raw: Tensor) -> Tensor:
-        return activate_density(raw[..., 0], self.density_activation, self.density_shift)
+    def _activated(self, raw: Tensor) -> Tensor:
+        return activate_density(raw, self.density_activation, self.density_shift)
+
+    def _at(self, series: Tensor, times: Tensor) -> Tensor:
+        """Values (..., n) of series (..., n K) at times (...,), or at one time ()."""
+        if self.time_terms == 1:
+            return series
+        dtype = torch.promote_types(torch.promote_types(series.dtype, times.dtype), torch.float32)
+        waves = torch.cos(math.pi * self.orders.to(dtype) * times[..., None].to(dtype))
+        terms = series.to(dtype).unflatten(-1, (-1, self.time_terms))
+        if times.ndim:
+            return (terms * waves[..., None, :]).sum(-1)
+        with torch.autocast(terms.device.type, enabled=False):
+            return terms @ waves
+
+    def contents(self, positions: Tensor) -> Tensor:
+        """The head's outputs (..., 4 K) at canonical positions (..., 3)."""
+        if not self.num_contents:
+            return super().contents(positions)
+        check_last_axis("positions", positions, 3)
+        return self._raw(positions, None)
+
+    def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
+        """Density (...,) and rgb (..., 3) of the head's outputs (..., 4 K) at times (...,), or at one time ()."""
+        self._check_contents(contents, times)
+        return self._shown(contents, times)
+
+    def _shown(self, series: Tensor, times: Tensor) -> FieldOutput:
+        values = self._at(series, times)
+        density = self._activated(values[..., 0])
+        return FieldOutput(density=density, rgb=torch.sigmoid(values[..., 1:].to(density.dtype)))
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""
-        return self._density(self._raw(positions, times))
+        check_positions_times(positions, times)
+        return self._activated(self._at(self._raw(positions, times)[..., : self.time_terms], times)[..., 0])
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3), directions (..., 3) and times (...,)."""
+        check_positions_times(positions, times)
         raw = self._raw(positions, times)
-        density = self._density(raw)
-        color = raw[..., 1:]
-        if self.encode_directions is not None:
-            check_shape("directions", directions, positions.shape)
-            color = self.to_rgb(torch.cat([torch.relu(color), self.encode_directions(directions)], dim=-1))
-        return FieldOutput(density=density, rgb=torch.sigmoid(color.to(density.dtype)))
+        if self.encode_directions is None:
+            return self._shown(raw, times)
+        check_shape("directions", directions, positions.shape)
+        features = torch.relu(raw[..., self.time_terms :])
+        colors = self.to_rgb(torch.cat([features, self.encode_directions(directions)], dim=-1))
+        return self._shown(torch.cat([raw[..., : self.time_terms], colors], dim=-1), times)
+
+
+@torch.no_grad()
+def _begin_constant(network: MLP, num_series: int, num_terms: int) -> None:
+    """Let the series that a fresh network's first outputs are begin without the terms that change."""
+    assert network.output is not None
+    for part in (network.output.weight, network.output.bias):
+        part[: num_series * num_terms].unflatten(0, (num_series, num_terms))[:, 1:] = 0

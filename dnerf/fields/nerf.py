@@ -11,6 +11,7 @@ from dnerf.deformations.base import check_positions_times
 from dnerf.encodings import SinusoidalEncoding
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField
+from dnerf.geometry import check_last_axis
 from dnerf.mlp import MLP
 
 
@@ -60,12 +61,29 @@ class NeRFField(RadianceField):
             self.to_rgb = nn.Linear(hidden_features, 3)
 
     @property
-    def is_fixed(self) -> bool:
-        """Whether colour does not depend on the direction; nothing depends on the time."""
-        return self.encode_directions is None
+    def num_contents(self) -> int:
+        """Density and colour before their activations; none if colour depends on the direction."""
+        return 4 if self.encode_directions is None else 0
+
+    def contents(self, positions: Tensor) -> Tensor:
+        """Density and colour before their activations (..., 4) at canonical positions (..., 3)."""
+        if self.encode_directions is not None:
+            return super().contents(positions)
+        check_last_axis("positions", positions, 3)
+        features = self.trunk(self.encode_positions(positions))
+        return torch.cat([self.to_density(features), self.to_rgb(features)], dim=-1)
+
+    def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
+        """Density (...,) and rgb (..., 3) of contents (..., 4); times are not used."""
+        self._check_contents(contents, times)
+        density = self._activated(contents[..., 0])
+        return FieldOutput(density=density, rgb=torch.sigmoid(contents[..., 1:].to(density.dtype)))
+
+    def _activated(self, raw: Tensor) -> Tensor:
+        return activate_density(raw, self.density_activation, self.density_shift)
 
     def _density(self, features: Tensor) -> Tensor:
-        return activate_density(self.to_density(features)[..., 0], self.density_activation, self.density_shift)
+        return self._activated(self.to_density(features)[..., 0])
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3); times (...,) are not used."""
@@ -75,9 +93,10 @@ class NeRFField(RadianceField):
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3) seen along directions (..., 3)."""
         check_positions_times(positions, times)
+        if self.encode_directions is None:
+            return self.from_contents(self.contents(positions), times)
+        check_shape("directions", directions, positions.shape)
         features = self.trunk(self.encode_positions(positions))
         density = self._density(features)
-        if self.encode_directions is not None:
-            check_shape("directions", directions, positions.shape)
-            features = torch.cat([self.features(features), self.encode_directions(directions)], dim=-1)
+        features = torch.cat([self.features(features), self.encode_directions(directions)], dim=-1)
         return FieldOutput(density=density, rgb=torch.sigmoid(self.to_rgb(features).to(density.dtype)))

@@ -21,17 +21,22 @@ BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5]]
 class Smooth(RadianceField):
     """A field whose log-density and colours bend smoothly, and which counts what it is asked."""
 
-    is_fixed = True
+    num_contents = 4
     num_points = 0
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         return self(positions, positions, times).density
 
+    def contents(self, positions: Tensor) -> Tensor:
+        self.num_points += positions.shape[:-1].numel()
+        depth = 2 * torch.sin(2 * positions).sum(-1, keepdim=True)
+        return torch.cat([depth, 0.5 + 0.5 * torch.sin(3 * positions)], dim=-1)
+
+    def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
+        return FieldOutput(density=contents[..., 0].exp(), rgb=contents[..., 1:])
+
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
-        self.num_points += times.numel()
-        return FieldOutput(
-            density=torch.exp(2 * torch.sin(2 * positions).sum(-1)), rgb=0.5 + 0.5 * torch.sin(3 * positions)
-        )
+        return self.from_contents(self.contents(positions), times)
 
 
 def points(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -104,20 +109,26 @@ def test_any_shape_is_answered_and_nothing_is_nothing() -> None:
     assert baked.density(torch.zeros(0, 3), torch.zeros(0)).shape == (0,)
 
 
-def test_empty_space_stays_empty() -> None:
-    class Nothing(Smooth):
-        def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
-            return FieldOutput(density=positions.new_zeros(positions.shape[:-1]), rgb=torch.zeros_like(positions))
-
-    output = asked(Baking(BOX, 16).bake(Nothing()), points(50))
-    assert float(output.density.max()) < 1e-19  # a logarithm of nothing is not finite
-    assert not output.rgb.any()
+def test_matter_that_changes_is_kept_for_all_times() -> None:
+    torch.manual_seed(0)
+    field = GridField(BOX, (4, 8), 2, hidden_features=16, num_layers=1, time_terms=3)
+    for parameter in field.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    x, spread = points(300), torch.linspace(0, 1, 300, dtype=torch.float64)
+    baked = Baking(BOX, 256).bake(field)
+    colors = []
+    for times in (torch.zeros(300, dtype=torch.float64), torch.full((300,), 0.7, dtype=torch.float64), spread):
+        exact, kept = field.double()(x, x, times), baked(x, x, times)
+        torch.testing.assert_close(kept.density, exact.density, rtol=5e-2, atol=0)
+        torch.testing.assert_close(kept.rgb, exact.rgb, rtol=0, atol=2e-2)
+        colors.append(kept.rgb)
+    assert (colors[0] - colors[1]).abs().max() > 0.2
 
 
 @pytest.mark.parametrize("options", [{"time_frequencies": 2}, {"view_degree": 2}])
 def test_fields_that_change_are_not_baked(options: dict[str, Any]) -> None:
     field = GridField(BOX, (4,), 2, **options)
-    with pytest.raises(ValueError, match="must depend on the position alone"):
+    with pytest.raises(ValueError, match="must have contents to keep, got a GridField"):
         Baking(BOX, 16).bake(field)
     model = DeformedField(DisplacementDeformation(1, 8, ()), field, baking=Baking(BOX, 16))
     assert model.finished() is model
@@ -174,11 +185,16 @@ def test_modes_of_shared_parts_are_left_alone() -> None:
     assert field.deformation.training
 
 
-def test_networks_in_bfloat16_are_baked_too() -> None:
+@pytest.mark.parametrize("time_terms", [1, 4])
+def test_networks_in_bfloat16_are_baked_too(time_terms: int) -> None:
     torch.manual_seed(0)
-    field, x = GridField(BOX, (8, 16), 4, hidden_features=16, num_layers=1), points(300, dtype=torch.float32)
+    field = GridField(BOX, (8, 16), 4, hidden_features=16, num_layers=1, time_terms=time_terms)
+    x = points(300, dtype=torch.float32)
     with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
-        baked, exact = asked(Baking(BOX, 128).bake(field), x), asked(field, x)
+        kept = Baking(BOX, 128).bake(field)
+        baked, exact = asked(kept, x), asked(field, x)
+        contents = kept.contents(x)
+    assert torch.equal(baked.density, field.from_contents(contents, torch.tensor(0.0)).density)  # nothing is rounded
     assert baked.density.dtype == torch.float32
     # bfloat16 keeps 8 bits of logarithms of size 1.
     torch.testing.assert_close(baked.density, exact.density, rtol=2e-2, atol=0)

@@ -13,10 +13,11 @@ from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField
 
 @dataclass(frozen=True)
 class Case:
-    """How to build a small field, and whether its colour depends on the viewing direction."""
+    """How to build a small field, whether its colour depends on the viewing direction, how many contents it has."""
 
     make: Callable[[], RadianceField]
     view_dependent: bool = False
+    num_contents: int = 0
 
 
 def small_nerf(view_dependent: bool = False, density_activation: str = "softplus") -> NeRFField:
@@ -30,18 +31,20 @@ def small_displacement() -> DisplacementDeformation:
     return DisplacementDeformation(2, 16, (), position_frequencies=3, time_frequencies=3)
 
 
-def small_grid(time_frequencies: int | None = None, view_degree: int | None = None) -> GridField:
+def small_grid(time_frequencies: int | None = None, view_degree: int | None = None, time_terms: int = 1) -> GridField:
     return GridField(
         [[-1, -1.5, -1], [1, 1.5, 2]], (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1,
-        time_frequencies=time_frequencies, view_degree=view_degree,
+        time_frequencies=time_frequencies, view_degree=view_degree, time_terms=time_terms,
     )  # fmt: skip
 
 
 FIELDS = {
-    "nerf": Case(small_nerf),
-    "nerf, exp density": Case(lambda: small_nerf(density_activation="exp")),
+    "nerf": Case(small_nerf, num_contents=4),
+    "nerf, exp density": Case(lambda: small_nerf(density_activation="exp"), num_contents=4),
     "nerf, view-dependent": Case(lambda: small_nerf(view_dependent=True), view_dependent=True),
-    "grid": Case(small_grid),
+    "grid": Case(small_grid, num_contents=4),
+    "grid, changing": Case(lambda: small_grid(time_terms=3), num_contents=12),
+    "grid, changing and view-dependent": Case(lambda: small_grid(view_degree=2, time_terms=3), True),
     "grid, timed and view-dependent": Case(lambda: small_grid(time_frequencies=3, view_degree=2), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),
@@ -214,3 +217,35 @@ def test_directions_of_another_shape_are_named(name: str, shape: tuple[int, ...]
     with pytest.raises(ValueError) as error:
         FIELDS[name].make()(torch.zeros(4, 3), torch.ones(shape), torch.zeros(4))
     assert str(error.value) == f"directions must have shape (4, 3), got {shape}"
+
+
+@every_field
+def test_contents_say_all_that_the_field_says(name: str) -> None:
+    field = trained(name)
+    positions, directions, times = some_points(4, 9)
+    assert field.num_contents == FIELDS[name].num_contents
+    if not field.num_contents:
+        for ask in (lambda: field.contents(positions), lambda: field.from_contents(positions, times)):
+            with pytest.raises(ValueError, match="has no contents"):
+                ask()
+        return
+    contents = field.contents(positions)
+    assert contents.shape == (4, 9, field.num_contents)
+    said, output = field.from_contents(contents, times), field(positions, directions, times)
+    assert torch.equal(said.density, output.density)
+    assert torch.equal(said.rgb, output.rgb)
+    moment = torch.tensor(0.3)
+    one, same = field.from_contents(contents, moment), field(positions, directions, moment.expand(4, 9))
+    torch.testing.assert_close(one.density, same.density)
+    torch.testing.assert_close(one.rgb, same.rgb)
+
+
+@pytest.mark.parametrize("name", [name for name, case in FIELDS.items() if case.num_contents])
+def test_contents_that_do_not_fit_are_refused(name: str) -> None:
+    field, contents = trained(name), torch.zeros(5, FIELDS[name].num_contents)
+    with pytest.raises(ValueError, match="positions must"):
+        field.contents(torch.zeros(5, 1))
+    with pytest.raises(ValueError, match="contents must have shape"):
+        field.from_contents(torch.zeros(5, 7), torch.zeros(5))
+    with pytest.raises(ValueError, match=r"times must have shape \(\) or \(5,\)"):
+        field.from_contents(contents, torch.zeros(5, 1))

@@ -57,11 +57,31 @@ def test_time_features_let_a_place_change_with_time() -> None:
         assert torch.equal(first, last) != changes
 
 
+@pytest.mark.parametrize("view_degree", [None, 1])
+def test_density_and_colour_follow_cosine_series_that_begin_constant(view_degree: int | None) -> None:
+    """Before their activations, values at six times determine three cosines, and those the values at all others."""
+    field = small(time_terms=3, view_degree=view_degree).double()
+    positions = (torch.rand(20, 1, 3) + torch.tensor([0.0, 0.0, 3.0])).double().expand(20, 41, 3)
+    times = torch.linspace(0, 1, 41, dtype=torch.float64).expand(20, 41)
+    fresh = field(positions, positions, times)
+    torch.testing.assert_close(fresh.density, fresh.density[:, :1].expand_as(fresh.density), rtol=1e-12, atol=0)
+    torch.testing.assert_close(fresh.rgb, fresh.rgb[:, :1].expand_as(fresh.rgb), rtol=1e-12, atol=0)
+    for parameter in field.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    output = field(positions, positions, times)
+    values = torch.cat([output.density.log()[..., None], torch.logit(output.rgb)], dim=-1)
+    basis = torch.cos(torch.pi * torch.arange(3, dtype=torch.float64) * times[0, :, None])
+    found = torch.linalg.lstsq(basis[::8].expand(20, -1, -1), values[:, ::8]).solution
+    torch.testing.assert_close(basis @ found, values, rtol=0, atol=1e-9)
+    assert (found[:, 1:].abs().amax((0, 1)) > 1e-3).all()
+
+
 @pytest.mark.parametrize(
     ("box", "options", "message"),
     [
         ([[0, 0, 0], [1, 0, 1]], {}, "box must have finite corners"),
         (BOX, {"num_features": 0}, "num_features must be > 0"),
+        (BOX, {"time_terms": 0}, "time_terms must be > 0"),
         (BOX, {"resolutions": ()}, "resolutions"),
     ],
 )

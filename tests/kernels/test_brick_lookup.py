@@ -70,7 +70,7 @@ def test_numba_equals_reference(shape, share, num_features, count, seed):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("num_features", [1, 3, 4])
+@pytest.mark.parametrize("num_features", [1, 3, 4, 16])
 @pytest.mark.parametrize("count", [0, 1, 1000])
 def test_compiled_equals_reference(compiled, dtype, num_features, count):
     shape = (3, 1, 2)

@@ -18,6 +18,7 @@ BOX = [[-1.5] * 3, [1.5] * 3]
 FIELDS = {
     "nerf": lambda: NeRFField(4, 64, (2,), view_dependent=True),
     "grid": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, view_degree=3, time_frequencies=4),
+    "grid, changing": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, time_terms=4),
     "deformed": lambda: DeformedField(moving(), GridField(BOX, (8, 16), 8)),
 }
 
