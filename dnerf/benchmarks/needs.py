@@ -32,15 +32,19 @@ def run(settings: Settings) -> SuiteResult:
     """Train with everything, without each part, and without all parts that were not missed."""
     options = {**settings.options, **(QUICK if settings.quick else {})}
     parts = dict(list(options["parts"].items())[:2] if settings.quick else options["parts"])
-    trial = _trainer(settings, options)
-    full = trial(FULL, [])
-    without = {name: trial(f"without {name}", overrides) for name, overrides in parts.items()}
-    best = max([full, *without.values()], key=lambda t: t.psnr)
-    removed, smallest = smallest_enough(full, without, parts, trial, best.psnr - TOLERANCE)
+    train = _trainer(settings, options)
+
+    def trial(names: Sequence[str]) -> Trial:
+        return train(f"without {', '.join(names)}", removing(names, parts, options["includes"]))
+
+    full = train(FULL, [])
+    without = {name: trial([name]) for name in parts}
+    removed, smallest = smallest_enough(full, without, trial)
+    best = max([full, smallest, *without.values()], key=lambda t: t.psnr)
     rows = [_row(FULL, full, full), *(_row(f"without {name}", t, full) for name, t in without.items())]
     if len(removed) > 1:
         rows.append(_row(f"{SMALLEST}: without {', '.join(removed)}", smallest, full))
-    kept = last_of_each([*_base(options), *(o for name in removed for o in parts[name])])
+    kept = last_of_each([*_base(options), *removing(removed, parts, options["includes"])])
     scene = scene_overrides(options["scene"], options["resolution"], options["data_root"])
     line = shlex.join(kept)
     missed = ", ".join(name for name in parts if name not in removed) or "none"
@@ -51,8 +55,8 @@ def run(settings: Settings) -> SuiteResult:
             f"(`{' '.join(options['full'])}`), then with one part removed at a time, each trained for "
             f"{options['seconds']:g} s and scored on {options['frames']} unseen frames of {options['resolution']} x "
             f"{options['resolution']} pixels. All get the same time, so a part must earn what it costs. Parts whose "
-            f"removal loses at most {TOLERANCE} dB against the best are then removed together; if that loses more, the "
-            "most valuable ones are put back, as few as a search by halves finds to be enough."
+            f"removal loses at most {TOLERANCE} dB are then removed together; if that ends more than {TOLERANCE} dB "
+            "below the best so far, the most valuable ones are put back, as few as a search by halves finds to do."
         ),
         tables=[
             Table(
@@ -68,7 +72,7 @@ def run(settings: Settings) -> SuiteResult:
             f"{smallest.psnr:.2f} dB with {smallest.num_parameters:,} parameters, {smallest.step_ms:.3g} ms a step and "
             f"{smallest.peak_mib:.0f} MiB: `{line}`",
             f"To train it: `python scripts/train.py {shlex.join([*kept, *scene])}`",
-            f"{options['scene']} does not miss: {', '.join(removed) or 'nothing'}. It needs: {missed}.",
+            f"{options['scene']} does not miss: {', '.join(removed) or 'nothing'}. Kept: {missed}.",
         ],
     )
 
@@ -79,33 +83,42 @@ def last_of_each(overrides: Sequence[str]) -> list[str]:
     return [override for override in overrides if last[override.partition("=")[0]] == override]
 
 
-def smallest_enough(
-    full: Trial,
-    without: Mapping[str, Trial],
-    parts: Mapping[str, Sequence[str]],
-    trial: Callable[[str, Sequence[str]], Trial],
-    enough: float,
-) -> tuple[list[str], Trial]:
-    """Names of the parts that can go together, and what is left then.
+def removing(
+    names: Sequence[str], parts: Mapping[str, Sequence[str]], includes: Mapping[str, Sequence[str]]
+) -> list[str]:
+    """Overrides that remove some parts together.
 
-    Parts are put back in the order of what they are worth; how many must be is found by bisection, which takes for
-    granted that more parts are not worse.
+    Args:
+        names: of the parts.
+        parts: overrides that remove each alone.
+        includes: parts that are gone with another, whose own overrides would not fit any more.
+    """
+    gone = {part for name in names for part in includes.get(name, ())}
+    return [override for name in names if name not in gone for override in parts[name]]
+
+
+def smallest_enough(
+    full: Trial, without: Mapping[str, Trial], trial: Callable[[Sequence[str]], Trial]
+) -> tuple[list[str], Trial]:
+    """Names of the parts that can go together, and what is left then: within `TOLERANCE` of the best seen before.
+
+    Only parts that are not missed alone can go. They are put back in the order of what they are worth; how many must be
+    is found by bisection, which takes for granted that more parts are not worse.
 
     Args:
         full: scores with all parts.
         without: scores with one part removed.
-        parts: overrides that remove each.
-        trial: trains and scores a name and its overrides.
-        enough: PSNR in dB that the result must reach; if nothing reaches it, all parts stay.
+        trial: trains and scores without some parts.
     """
-    removed = sorted((name for name, t in without.items() if t.psnr >= enough), key=lambda n: without[n].psnr)
+    enough = max(t.psnr for t in [full, *without.values()]) - TOLERANCE
+    harmless = [name for name, t in without.items() if t.psnr >= full.psnr - TOLERANCE]
+    removed = sorted(harmless, key=lambda name: without[name].psnr)
     if not removed:
         return [], full
     fewest, most, found = 0, len(removed) - 1, without[removed[-1]]
     while fewest < most:
         put_back = (fewest + most) // 2
-        gone = removed[put_back:]
-        together = trial(f"without {', '.join(gone)}", [o for name in gone for o in parts[name]])
+        together = trial(removed[put_back:])
         if together.psnr >= enough:
             most, found = put_back, together
         else:

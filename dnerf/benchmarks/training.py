@@ -36,7 +36,11 @@ def run(settings: Settings) -> SuiteResult:
             "compiling kernels left out, as the trainer counts), with learning rates that end with the budget, and is "
             f"then scored at {options['resolution']} x {options['resolution']} pixels on frames it has not seen. "
             "Memory is the most the process ever held, data, training and scoring together."
-            + "".join(f" `{name}` runs with `{' '.join(words)}`." for name, words in options["overrides"].items())
+            + "".join(
+                f" `{name}` runs with `{' '.join(words)}`."
+                for name, words in options["overrides"].items()
+                if name in options["experiments"]
+            )
         ),
         tables=[
             Table("Means over seeds", means, "psnr_low, psnr_high: worst and best seed. frames: how many were scored."),

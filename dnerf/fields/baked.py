@@ -32,8 +32,7 @@ class Baking:
             the field itself is asked.
         resolution: cells along the box's longest side.
         max_bricks: most bricks of 8 x 8 x 8 cells that are kept, of 2.9 KiB for each number of a field's contents (46
-            KiB each and 364 MiB in all for 16); if more are needed, all are forgotten, with a warning, since this
-            costs more than it saves.
+            KiB each and 364 MiB in all for 16); where there is no room for more, the field itself is asked.
 
     Raises:
         ValueError: for a box that is none, or numbers that are not positive.
@@ -80,7 +79,7 @@ class BakedField(RadianceField):
         self.cells_per_unit = baking.cells_per_unit
         self.max_bricks = baking.max_bricks
         self.num_bricks = 0
-        self.has_overflown = False
+        self.is_full = False
         self.slots = torch.full(baking.shape, -1)  # per brick of the box: its number, -1 if it does not exist
         self.bricks = torch.zeros(0, VERTICES, field.num_contents)  # at its vertices
 
@@ -118,21 +117,17 @@ class BakedField(RadianceField):
         return values.reshape(*positions.shape[:-1], values.shape[-1])
 
     def _values(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (N, C) at places (N, 3) in cells, and whether they are in the box (N,)."""
+        """Values (N, C) at places (N, 3) in cells, and where they are known (N,): in the box, while there is room."""
         found = brick_lookup(cells, self.slots, self.bricks)
+        if self.is_full:
+            return found
         missing = self._missing(cells[~found[1]])
         if not len(missing):
             return found
         if self.num_bricks + len(missing) > self.max_bricks:
-            if not self.has_overflown:
-                logger.warning("baking: more than %d bricks are needed, frames take longer", self.max_bricks)
-            self.has_overflown = True
-            self.slots.fill_(-1)
-            self.num_bricks = 0
-            missing = self._missing(cells)
-            if len(missing) > self.max_bricks:
-                halves = [self._values(part) for part in cells.split(-(-len(cells) // 2))]
-                return torch.cat([h[0] for h in halves]), torch.cat([h[1] for h in halves])
+            logger.warning("baking: no room for more than %d bricks, the field is asked itself", self.max_bricks)
+            self.is_full = True
+            return found
         self._make(missing)
         return brick_lookup(cells, self.slots, self.bricks)
 

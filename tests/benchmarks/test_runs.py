@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from dnerf.benchmarks import runs
-from dnerf.benchmarks.needs import Trial, last_of_each, smallest_enough
+from dnerf.benchmarks.needs import Trial, last_of_each, removing, smallest_enough
 from dnerf.benchmarks.runs import run_training
 from dnerf.benchmarks.scenes import scene_overrides
 from dnerf.benchmarks.suite import Settings
@@ -66,7 +66,7 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     options = {
         "scenes": ["walker", "static"], "experiments": ["fast", "dnerf"], "seconds": [4, 8], "seeds": [0, 2],
         "resolution": 50, "frames": {"dnerf": 2}, "splits": {"static": "val"}, "data_root": None,
-        "overrides": {"dnerf": ["trainer.num_rays=64"]},
+        "overrides": {"dnerf": ["trainer.num_rays=64"], "flow": ["seed=9"]},
     }  # fmt: skip
     result = run_training_suite(Settings(work_dir=tmp_path / "work", train_command=command, options=options))
     means = result.tables[0].rows
@@ -84,51 +84,63 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     assert len(with_few_rays) == 8
     assert all("experiment=dnerf" in call.split() for call in with_few_rays)
     assert "`dnerf` runs with `trainer.num_rays=64`" in result.summary
+    assert "flow" not in result.summary
 
 
 def trial(psnr):
     return Trial(psnr, 0, 0, 0, 0, 0)
 
 
-@pytest.mark.parametrize(
-    ("together", "removed"),
-    [({"without b, a": 29.95}, ["b", "a"]), ({"without b, a": 29.0}, ["a"])],
-)
+@pytest.mark.parametrize(("together", "removed"), [(29.95, ["b", "a"]), (29.0, ["a"])])
 def test_parts_that_are_missed_together_are_put_back_the_most_valuable_first(together, removed):
     without = {"a": trial(30.0), "b": trial(29.95), "c": trial(25.0)}
-    parts = {name: [f"part={name}"] for name in without}
     tried = []
 
-    def train(name, overrides):
-        tried.append((name, list(overrides)))
-        return trial(together[name])
+    def train(names):
+        tried.append(names)
+        return trial(together)
 
-    names, smallest = smallest_enough(trial(29.92), without, parts, train, 29.9)
+    names, smallest = smallest_enough(trial(29.92), without, train)
     assert names == removed
     assert smallest.psnr >= 29.9
-    assert tried == [("without b, a", ["part=b", "part=a"])]
+    assert tried == [["b", "a"]]
 
 
-@pytest.mark.parametrize("enough", [0.0, -0.5, -1.0, -2.5, -6.0, -100.0])
-def test_as_few_parts_as_needed_are_put_back_by_few_trainings(enough):
+@pytest.mark.parametrize("missed_by", [0.0, 0.2, 0.5, 2.5, 6.0, 100.0])
+def test_as_few_parts_as_needed_are_put_back_by_few_trainings(missed_by):
     worth = {name: 0.25 * (8 - number) for number, name in enumerate("abcdefgh")}  # a is worth most
     without = {name: trial(0.0) for name in worth}  # and nothing is missed alone
     tried = []
 
-    def train(name, overrides):
-        tried.append(name)
-        return trial(-sum(worth[part] for part in overrides))
+    def train(names):
+        tried.append(names)
+        return trial(missed_by - sum(worth[name] for name in names))
 
-    names, _ = smallest_enough(trial(0.0), without, {name: [name] for name in worth}, train, enough)
-    kept = [k for k in range(len(worth)) if -sum(list(worth.values())[k:]) >= enough]
+    names, _ = smallest_enough(trial(0.0), without, train)
+    kept = [k for k in range(len(worth)) if missed_by - sum(list(worth.values())[k:]) >= -0.1]
     assert names == list(worth)[min([*kept, len(worth) - 1]) :]
     assert len(tried) <= 3  # log2(8)
 
 
+def test_what_hinders_does_not_make_other_parts_needed():
+    """Without b all is much better; a and c are no more missed for that."""
+    without = {"a": trial(20.0), "b": trial(25.0), "c": trial(20.5), "d": trial(18.0)}
+    names, smallest = smallest_enough(trial(20.0), without, lambda names: trial(25.0 + len(names)))
+    assert names == ["a", "c", "b"]
+    assert smallest.psnr == 28
+    worse = smallest_enough(trial(20.0), without, lambda names: trial(24.0))
+    assert worse == (["b"], without["b"])
+
+
 def test_all_parts_stay_if_each_is_missed():
-    without = {"a": trial(20.0)}
     full = trial(30.0)
-    assert smallest_enough(full, without, {"a": []}, lambda name, overrides: full, 29.9) == ([], full)
+    assert smallest_enough(full, {"a": trial(20.0)}, lambda names: full) == ([], full)
+
+
+def test_a_part_that_is_gone_with_another_is_not_removed_twice():
+    parts, includes = {"a": ["a=1"], "b": ["a.c=2", "d=3"]}, {"a": ["b"]}
+    assert removing(["b", "a"], parts, includes) == ["a=1"]
+    assert removing(["b"], parts, includes) == ["a.c=2", "d=3"]
 
 
 def test_an_override_that_is_replaced_is_not_printed():

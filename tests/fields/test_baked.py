@@ -87,10 +87,6 @@ def test_what_is_kept_does_not_depend_on_the_order_in_which_it_was_asked() -> No
     for i in reversed(range(0, 500, 100)):
         asked(second, x[i : i + 100])
     assert torch.equal(asked(first, x).density, asked(second, x).density)
-    crowded = Baking(BOX, 48, max_bricks=5).bake(field)
-    assert torch.equal(asked(first, x).density, asked(crowded, x).density)
-    assert len(crowded.bricks) <= 5
-    assert first.num_bricks > 5
 
 
 def test_outside_the_box_the_field_itself_is_asked() -> None:
@@ -209,12 +205,21 @@ def test_places_that_are_none_are_asked_of_the_field(backend: str) -> None:
     assert density.isfinite().tolist() == [True, False, False]
 
 
-def test_room_that_does_not_suffice_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    baked = Baking(BOX, 64, max_bricks=3).bake(Smooth())
-    for seed in range(3):
-        asked(baked, points(20, seed))
-    assert [record.message for record in caplog.records if "more than 3 bricks" in record.message] == [
-        "baking: more than 3 bricks are needed, frames take longer"
+def test_where_there_is_no_room_the_field_itself_is_asked_and_that_is_told_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    field, few = Smooth(), points(2)
+    baked = Baking(BOX, 64, max_bricks=3).bake(field)
+    kept = asked(baked, few).density
+    assert baked.num_bricks == 2
+    for seed in range(1, 4):
+        many = points(20, seed)
+        torch.testing.assert_close(asked(baked, many).density, asked(field, many).density)
+    assert torch.equal(asked(baked, few).density, kept)
+    assert not torch.equal(asked(field, few).density, kept)
+    assert baked.num_bricks == 2
+    assert [record.message for record in caplog.records] == [
+        "baking: no room for more than 3 bricks, the field is asked itself"
     ]
 
 

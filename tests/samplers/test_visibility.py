@@ -219,3 +219,18 @@ def test_haze_is_asked_in_rounds_of_bounded_size() -> None:
     visible_samples(samples, rays, field, 1e-6, first_round=64, most_at_once=100)
     assert sum(sizes) == 1500
     assert max(sizes) <= 100
+
+
+def test_the_filter_asks_no_more_of_haze_at_once_than_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+
+    class Haze(FormulaField):
+        def density(self, positions: Tensor, times: Tensor) -> Tensor:
+            sizes.append(len(times))
+            return torch.full_like(times, 1e-3)
+
+    monkeypatch.setattr("dnerf.samplers.occupancy.MOST_AT_ONCE", 200)
+    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-7, pad_to=1).train()
+    samples = sampler(rays_towards_origin(64), Haze(lambda x: x[..., 0], lambda x, d, t: x))
+    assert samples.starts.numel() > 2000  # rays of some fifty intervals or more, all of them kept
+    assert max(sizes) <= 200
