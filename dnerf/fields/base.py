@@ -27,9 +27,12 @@ class RadianceField(nn.Module, ABC):
             `FieldOutput` with density (...,) and rgb (..., 3) in [0, 1].
         """
 
+    def _without_contents(self) -> ValueError:
+        return ValueError(f"{type(self).__name__} has no contents that say all about a place (num_contents is 0)")
+
     def _check_contents(self, contents: Tensor, times: Tensor) -> None:
         if not self.num_contents:
-            RadianceField.contents(self, contents)
+            raise self._without_contents()
         if contents.shape[-1:] != (self.num_contents,):
             raise ValueError(f"contents must have shape (..., {self.num_contents}), got {tuple(contents.shape)}")
         if times.ndim and times.shape != contents.shape[:-1]:
@@ -48,7 +51,7 @@ class RadianceField(nn.Module, ABC):
         Raises:
             ValueError: for a field without such numbers (`num_contents` is 0), or positions of another shape.
         """
-        raise ValueError(f"{type(self).__name__} has no contents that say all about a place (num_contents is 0)")
+        raise self._without_contents()
 
     def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
         """What `forward` says of places, from their contents (..., C), at times (...,) or one time () for all.
@@ -56,7 +59,7 @@ class RadianceField(nn.Module, ABC):
         Raises:
             ValueError: for a field without contents, or shapes that do not fit.
         """
-        raise ValueError(f"{type(self).__name__} has no contents that say all about a place (num_contents is 0)")
+        raise self._without_contents()
 
     def finished(self) -> "RadianceField":
         """The field to ask once nothing is learnt any more; itself, unless something can be kept between frames."""

@@ -142,7 +142,7 @@ class GridField(RadianceField):
     def contents(self, positions: Tensor) -> Tensor:
         """The head's outputs (..., 4 K) at canonical positions (..., 3)."""
         if not self.num_contents:
-            return super().contents(positions)
+            raise self._without_contents()
         check_last_axis("positions", positions, 3)
         return self._raw(positions, None)
 

@@ -68,7 +68,7 @@ class NeRFField(RadianceField):
     def contents(self, positions: Tensor) -> Tensor:
         """Density and colour before their activations (..., 4) at canonical positions (..., 3)."""
         if self.encode_directions is not None:
-            return super().contents(positions)
+            raise self._without_contents()
         check_last_axis("positions", positions, 3)
         features = self.trunk(self.encode_positions(positions))
         return torch.cat([self.to_density(features), self.to_rgb(features)], dim=-1)
