@@ -1,6 +1,7 @@
 """Sequences from the first frame to the finished files: rendered frame by frame, resumed, shared, put together."""
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,7 +59,7 @@ def render_frames_to(
     exact: bool = False,
     on_frame: Callable[[int], None] | None = None,
 ) -> int:
-    """Render the frames that the store lacks, each written as soon as it is done.
+    """Render the frames that the store lacks, each written while the next one is rendered.
 
     Args:
         store: where frames go; those it holds are left alone.
@@ -84,11 +85,23 @@ def render_frames_to(
     missing = [i for i in store.missing() if share.mine(i)]
     if not exact:
         renderer = renderer.for_sequence(len(views))  # of all, so that a frame is the same whoever renders it
-    for index in missing:
-        following = views[index + 1] if index + 1 < len(views) else None
-        store.write(index, render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk))
+
+    def finish(index: int, writing: Future[None]) -> None:
+        writing.result()
         if on_frame is not None:
             on_frame(index)
+
+    # Most of the time that a file takes is waiting for the disk.
+    with ThreadPoolExecutor(1) as writer:
+        in_hand: tuple[int, Future[None]] | None = None
+        for index in missing:
+            following = views[index + 1] if index + 1 < len(views) else None
+            layers = render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk)
+            if in_hand is not None:
+                finish(*in_hand)
+            in_hand = index, writer.submit(store.write, index, layers)
+        if in_hand is not None:
+            finish(*in_hand)
     return len(missing)
 
 

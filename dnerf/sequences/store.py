@@ -18,7 +18,7 @@ class FrameStore:
     """A folder of `frame_00000.npz`, ....
 
     A file holds a frame's layers and appears when it is complete, flushed to the disk: whoever is killed loses the
-    frame in hand and nothing else. Several processes may write different frames.
+    frames in hand and nothing else. Several processes may write different frames.
 
     Args:
         folder: where the files lie; made upon the first frame.
