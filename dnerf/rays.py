@@ -168,6 +168,42 @@ class Samples:
             ray_offsets=self.offsets + padding * (self.offsets == count),
         )
 
+    def kept(self, mask: Tensor) -> "Samples":
+        """Those packed samples for which `mask` (N,) holds; proposals are dropped."""
+        if self.ray_indices is None:
+            raise ValueError("samples must be packed to be chosen from, got dense samples")
+        check_shape("mask", mask, self.starts.shape)
+        chosen = mask.nonzero()[:, 0]
+        before = torch.nn.functional.pad(mask.cumsum(0), (1, 0))
+        return Samples(
+            self.starts[chosen],
+            self.ends[chosen],
+            self.num_rays,
+            ray_indices=self.ray_indices[chosen],
+            points=None if self.points is None else self.points[chosen],
+            ray_offsets=before[self.offsets],
+        )
+
+    def split(self, count: int) -> "Samples":
+        """Packed samples, each interval cut into so many equal ones, the field asked in the middle of each.
+
+        Raises:
+            ValueError: for dense samples, samples with points of their own, or a count below 1.
+        """
+        if self.ray_indices is None or self.points is not None or count < 1:
+            raise ValueError("samples must be packed, with their points in the middle, and cut into one part at least")
+        if count == 1:
+            return self
+        parts = torch.arange(count + 1, dtype=self.starts.dtype, device=self.starts.device) / count
+        edges = torch.lerp(self.starts[:, None], self.ends[:, None], parts)
+        return replace(
+            self,
+            starts=edges[:, :-1].reshape(-1),
+            ends=edges[:, 1:].reshape(-1),
+            ray_indices=self.ray_indices.repeat_interleave(count),
+            ray_offsets=self.offsets * count,
+        )
+
     def packed(self, mask: Tensor | None = None) -> "Samples":
         """Return dense samples as packed ones, only those where `mask` (R, S) holds (all if None)."""
         if self.ray_indices is not None:

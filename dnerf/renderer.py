@@ -116,8 +116,10 @@ class Renderer(nn.Module):
         sums = rays.origins.new_zeros(len(rays), 5)
 
         def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
+            chosen = rays[ray_numbers]
             with self.autocast(rays.origins.device):
-                output = field(*part.locate(rays[ray_numbers]))
+                part = self.sampler.refined(part, chosen, field, transmittance)
+                output = field(*part.locate(chosen))
             seen = composite(part, output)
             columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
             sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))

@@ -39,6 +39,20 @@ class Sampler(nn.Module, ABC):
         """
         return None
 
+    def refined(self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor) -> Samples:
+        """In evaluation mode, where the field is asked for what is seen of the samples that `first` placed.
+
+        Args:
+            samples: packed samples of R rays.
+            rays: R rays.
+            field: which is rendered.
+            transmittance: (R,) before each ray's first sample.
+
+        Returns:
+            Packed samples of the same rays, in the same intervals; those themselves unless overridden.
+        """
+        return samples
+
     def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
         """Pixels of a view in whose rays this sampler may place samples in evaluation mode; all unless overridden.
 

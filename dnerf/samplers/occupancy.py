@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from dnerf.cameras import Camera
 from dnerf.checks import as_box, check_positive
+from dnerf.compositing import render_weights
 from dnerf.fields.base import RadianceField
 from dnerf.geometry import cube_corners
 from dnerf.kernels import march, skip_distances
@@ -37,6 +38,8 @@ class OccupancySampler(Sampler):
     Args:
         box: (2, 3) corners of the space that is sampled, in world units.
         step_size: length of an interval, in world units.
+        splits: intervals in which something may be seen (see `min_weight`) are cut into so many, at which the field is
+            asked, in training from when `step_size` is reached: empty and hidden ones are passed in long steps.
         coarse_step: length of an interval when training begins; it shrinks evenly (by equal factors in equal progress)
             to `step_size`. Long intervals clear haze early and see more rays for the same samples, short ones
             sharpen surfaces later. None for `step_size` from the start; evaluation always takes `step_size`.
@@ -54,8 +57,8 @@ class OccupancySampler(Sampler):
         narrow_from: fraction of training, in [0, 1], from which on training marches through what pictures do: once
             shapes stand, most samples in the margin are asked for nothing. Probes still find what comes into being.
         min_weight: in training, the field is first asked for densities without gradients, front to back, and only
-            samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. (Pictures without
-            gradients end rays early instead: `Renderer.stop_transmittance`.)
+            samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. Pictures ask for
+            densities first only to find what is worth splitting; they end rays early (`Renderer.stop_transmittance`).
         filter_joins: the filter of `min_weight` asks once for so many neighbouring intervals, and keeps all or none.
         pad_to: in training the number of samples is rounded up to a multiple of this, see `Samples.padded` (1 for no
             padding).
@@ -82,6 +85,7 @@ class OccupancySampler(Sampler):
         margin: int = 1,
         render_margin: int = 1,
         narrow_from: float = 1.0,
+        splits: int = 1,
         min_weight: float = 0.0,
         filter_joins: int = 1,
         pad_to: int = 2048,
@@ -96,6 +100,7 @@ class OccupancySampler(Sampler):
             ("threshold", threshold),
             ("update_every", update_every),
             ("num_probes", num_probes),
+            ("splits", splits),
             ("filter_joins", filter_joins),
             ("pad_to", pad_to),
         ):
@@ -116,6 +121,8 @@ class OccupancySampler(Sampler):
         self.coarse_step = step_size if coarse_step is None else coarse_step
         self.coarse_until = coarse_until
         self.training_step = self.coarse_step
+        self.splits = splits
+        self.training_splits = splits if self.coarse_step == step_size else 1
         self.narrow_from = narrow_from
         self.is_narrow = False
         self.threshold = threshold
@@ -155,13 +162,27 @@ class OccupancySampler(Sampler):
         if self.training:
             jitter.uniform_(generator=generator)
         samples = self._march(rays, jitter)
-        if self.training and self.min_weight > 0:
+        if not self.training:
+            return samples.split(self.splits)
+        if self.min_weight > 0:
             samples = self._visible(samples, rays, field)
-        return samples.padded(self.pad_to) if self.training else samples
+        return samples.split(self.training_splits).padded(self.pad_to)
 
     def first(self, rays: Rays, most: int) -> Samples | None:
         """In evaluation mode, the first samples of each ray; what lies behind is not marched through."""
         return None if self.training else self._march(rays, torch.zeros_like(rays.near), most)
+
+    @torch.no_grad()
+    def refined(self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor) -> Samples:
+        """The intervals whose weight exceeds `min_weight`, split; all of them, as they are, if they are not split."""
+        if self.splits == 1:
+            return samples
+        if self.min_weight > 0:
+            positions, _, times = samples.locate(rays)
+            optical_depth = field.density(positions, times) * samples.lengths
+            weights = render_weights(optical_depth, samples) * samples.per_sample(transmittance)
+            samples = samples.kept(weights > self.min_weight)
+        return samples.split(self.splits).padded(self.pad_to)
 
     def _march(self, rays: Rays, jitter: Tensor, most: int | None = None) -> Samples:
         occupied, skips = self.occupied, self.skips
@@ -185,8 +206,9 @@ class OccupancySampler(Sampler):
         )
 
     def set_progress(self, progress: float) -> None:
-        """Shorten the intervals of training and drop its margin as it goes on, `progress` in [0, 1]."""
-        part = min(progress / self.coarse_until, 1.0)
+        """Shorten and split the intervals of training and drop its margin as it goes on, `progress` in [0, 1]."""
+        part = min(progress / self.coarse_until, 1.0) if self.coarse_step != self.step_size else 1.0
+        self.training_splits = self.splits if part == 1 else 1
         self.training_step = self.coarse_step * (self.step_size / self.coarse_step) ** part
         self.is_narrow = progress >= self.narrow_from
 
@@ -226,17 +248,7 @@ class OccupancySampler(Sampler):
             asked, rays, field, self.min_weight,
             first_round=FIRST_ROUND, most_at_once=MOST_AT_ONCE, pad_to=self.pad_to, observe=self.observe,
         )  # fmt: skip
-        marked = is_visible[number]
-        kept = marked.nonzero()[:, 0]
-        kept_before = torch.nn.functional.pad(marked.cumsum(0), (1, 0))
-        assert samples.ray_indices is not None
-        return Samples(
-            samples.starts[kept],
-            samples.ends[kept],
-            samples.num_rays,
-            ray_indices=samples.ray_indices[kept],
-            ray_offsets=kept_before[samples.offsets],
-        )
+        return samples.kept(is_visible[number])
 
     @torch.no_grad()
     def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:
