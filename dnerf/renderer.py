@@ -37,7 +37,8 @@ class Renderer(nn.Module):
         precision: "float32", or "bfloat16" to run networks under autocast; positions, encodings and compositing stay
             float32 either way.
         stop_transmittance: whole images end a ray of packed samples once so little light is left, which changes
-            colours by at most as much; 0 to ask the field everywhere. Without effect on other quadratures than the
+            colours by at most as much (a sampler that refines leaves out what is seen as little); 0 to ask the field
+            everywhere. Without effect on other quadratures than the
             constant one, whose intervals do not depend on their neighbours.
 
     Raises:
@@ -118,7 +119,7 @@ class Renderer(nn.Module):
         def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
             chosen = rays[ray_numbers]
             with self.autocast(rays.origins.device):
-                part = self.sampler.refined(part, chosen, field, transmittance)
+                part = self.sampler.refined(part, chosen, field, transmittance, self.stop_transmittance)
                 output = field(*part.locate(chosen))
             seen = composite(part, output)
             columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]

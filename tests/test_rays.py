@@ -1,9 +1,12 @@
 """Rays and samples: layouts, positions and the errors of shapes that do not fit."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from reference import rays_towards_origin
 from torch import Tensor
 
@@ -86,6 +89,40 @@ def test_packing_keeps_what_the_mask_holds() -> None:
 def test_packed_samples_are_not_packed_again() -> None:
     with pytest.raises(ValueError, match="must be dense"):
         ragged()[0].packed()
+
+
+def test_packed_samples_are_chosen_from_ray_by_ray() -> None:
+    starts = torch.arange(5.0)
+    packed = Samples(starts, starts + 1, 4, ray_indices=torch.tensor([0, 0, 2, 2, 3]), points=starts + 0.25)
+    kept = packed.kept(torch.tensor([False, True, False, True, False]))
+    assert kept.starts.tolist() == [1, 3]
+    assert kept.distances.tolist() == [1.25, 3.25]
+    assert kept.offsets.tolist() == [0, 1, 1, 2, 2]
+    assert replace(kept, ray_offsets=None).offsets.tolist() == kept.offsets.tolist()
+    none = packed.kept(torch.zeros(5, dtype=torch.bool))
+    assert none.offsets.tolist() == [0] * 5
+
+
+@given(st.integers(1, 5))
+def test_split_intervals_fill_what_they_were_cut_from(count: int) -> None:
+    starts = torch.tensor([0.0, 1.0, 5.0])
+    packed = Samples(starts, starts + torch.tensor([1.0, 0.5, 0.0]), 3, ray_indices=torch.tensor([0, 0, 2]))
+    split = packed.split(count)
+    assert torch.equal(split.starts[::count], packed.starts)
+    assert torch.equal(split.ends[count - 1 :: count], packed.ends)
+    torch.testing.assert_close(split.lengths, packed.lengths.repeat_interleave(count) / count, rtol=0, atol=1e-6)
+    parts = split.starts.reshape(3, count), split.ends.reshape(3, count)
+    assert torch.equal(parts[0][:, 1:], parts[1][:, :-1])
+    assert split.offsets.tolist() == [0, 2 * count, 2 * count, 3 * count]
+    assert torch.equal(split.offsets, replace(split, ray_offsets=None).offsets)
+
+
+def test_dense_samples_are_neither_chosen_from_nor_split() -> None:
+    dense = Samples(torch.zeros(2, 3), torch.ones(2, 3), 2)
+    with pytest.raises(ValueError, match="must be packed to be chosen from"):
+        dense.kept(torch.ones_like(dense.starts, dtype=torch.bool))
+    with pytest.raises(ValueError, match="must be packed"):
+        dense.split(2)
 
 
 def test_rays_are_sliced_masked_and_cast_together() -> None:

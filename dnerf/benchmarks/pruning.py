@@ -1,4 +1,4 @@
-"""What pruning costs and saves: occupancy, transmittance cut-off, step, and the lattices of deformation and field."""
+"""What pruning costs and saves: occupancy, transmittance cut-off, steps, and the lattices of deformation and field."""
 
 import copy
 from collections.abc import Iterator, Mapping
@@ -28,6 +28,7 @@ KNOBS = {
     "margin": "cells by which what training found is widened in space",
     "cut-off": "transmittance at which a ray ends",
     "step": "step along a ray (world units)",
+    "splits": "shortest steps in a marched one, which is split where something is seen, with the cut-off",
     "lattice": "cells of the lattice that the deformation is kept on",
     "baking": "cells of the lattice that canonical space is kept on",
 }
@@ -77,7 +78,7 @@ def run(settings: Settings) -> SuiteResult:
             "margin in space if the experiment renders so; `the experiment's own` adds its cut-off and the lattice of "
             "its deformation, and for a sequence that of canonical space, filled before the clock starts, unless haze "
             "forbids it. The "
-            f"reference samples the whole box at the trained step, {trained.step_size:g}, and leaves out nothing: "
+            f"reference samples the whole box at the experiment's shortest step, {_shortest(trained):g}, and leaves out nothing: "
             "errors are of pruning alone, not of the model. The experiment's own settings: threshold "
             f"{trained.threshold:g}, {int(trained.shape[1:].max())} cells, {int(trained.shape[0])} slabs, cut-off "
             f"{renderer.stop_transmittance:g}."
@@ -97,10 +98,15 @@ def run(settings: Settings) -> SuiteResult:
 
 def _grid(trained: OccupancySampler, *, resolution: int, num_slabs: int) -> OccupancySampler:
     grid = OccupancySampler(
-        trained.box.tolist(), trained.step_size, resolution, num_slabs=num_slabs, threshold=trained.threshold,
+        trained.box.tolist(), _shortest(trained), resolution, num_slabs=num_slabs, threshold=trained.threshold,
         margin=trained.margin, pad_to=trained.pad_to,
     )  # fmt: skip
     return grid.to(trained.box.device).eval()
+
+
+def _shortest(trained: OccupancySampler) -> float:
+    """Length of the intervals at which the field is asked in the end."""
+    return trained.step_size / trained.splits
 
 
 def _everything(trained: OccupancySampler) -> OccupancySampler:
@@ -150,6 +156,8 @@ def _settings(
         yield Setting("margin", 0, trained)
     for value in options["steps"][few]:
         yield Setting("step", value, changed(step_size=value))
+    for value in options["splits"][few]:
+        yield Setting("splits", value, changed(step_size=value * _shortest(trained), splits=value), cut)
     for value in options["cuts"][few]:
         yield Setting("cut-off", value, trained, value)
     for value in options["lattices"][few]:

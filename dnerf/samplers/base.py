@@ -39,7 +39,9 @@ class Sampler(nn.Module, ABC):
         """
         return None
 
-    def refined(self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor) -> Samples:
+    def refined(
+        self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
+    ) -> Samples:
         """In evaluation mode, where the field is asked for what is seen of the samples that `first` placed.
 
         Args:
@@ -47,6 +49,7 @@ class Sampler(nn.Module, ABC):
             rays: R rays.
             field: which is rendered.
             transmittance: (R,) before each ray's first sample.
+            min_weight: what has less of a share in the picture may be left out.
 
         Returns:
             Packed samples of the same rays, in the same intervals; those themselves unless overridden.

@@ -38,7 +38,7 @@ class OccupancySampler(Sampler):
     Args:
         box: (2, 3) corners of the space that is sampled, in world units.
         step_size: length of an interval, in world units.
-        splits: intervals in which something may be seen (see `min_weight`) are cut into so many, at which the field is
+        splits: intervals in which something is seen (see `min_weight`) are cut into so many, at which the field is
             asked, in training from when `step_size` is reached: empty and hidden ones are passed in long steps.
         coarse_step: length of an interval when training begins; it shrinks evenly (by equal factors in equal progress)
             to `step_size`. Long intervals clear haze early and see more rays for the same samples, short ones
@@ -57,8 +57,8 @@ class OccupancySampler(Sampler):
         narrow_from: fraction of training, in [0, 1], from which on training marches through what pictures do: once
             shapes stand, most samples in the margin are asked for nothing. Probes still find what comes into being.
         min_weight: in training, the field is first asked for densities without gradients, front to back, and only
-            samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. Pictures ask for
-            densities first only to find what is worth splitting; they end rays early (`Renderer.stop_transmittance`).
+            samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. (Pictures leave out
+            less than `Renderer.stop_transmittance` instead, and ask twice only to find what is to be split.)
         filter_joins: the filter of `min_weight` asks once for so many neighbouring intervals, and keeps all or none.
         pad_to: in training the number of samples is rounded up to a multiple of this, see `Samples.padded` (1 for no
             padding).
@@ -173,16 +173,16 @@ class OccupancySampler(Sampler):
         return None if self.training else self._march(rays, torch.zeros_like(rays.near), most)
 
     @torch.no_grad()
-    def refined(self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor) -> Samples:
+    def refined(
+        self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
+    ) -> Samples:
         """The intervals whose weight exceeds `min_weight`, split; all of them, as they are, if they are not split."""
         if self.splits == 1:
             return samples
-        if self.min_weight > 0:
-            positions, _, times = samples.locate(rays)
-            optical_depth = field.density(positions, times) * samples.lengths
-            weights = render_weights(optical_depth, samples) * samples.per_sample(transmittance)
-            samples = samples.kept(weights > self.min_weight)
-        return samples.split(self.splits).padded(self.pad_to)
+        positions, _, times = samples.locate(rays)
+        optical_depth = field.density(positions, times) * samples.lengths
+        weights = render_weights(optical_depth, samples) * samples.per_sample(transmittance)
+        return samples.kept(weights > min_weight).split(self.splits).padded(self.pad_to)
 
     def _march(self, rays: Rays, jitter: Tensor, most: int | None = None) -> Samples:
         occupied, skips = self.occupied, self.skips

@@ -13,6 +13,7 @@ from dnerf.compositing import FieldOutput, composite
 from dnerf.fields import RadianceField
 from dnerf.kernels import skip_distances
 from dnerf.rays import Rays
+from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, Sampler
 
 BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
@@ -113,6 +114,44 @@ def test_intervals_of_training_shrink_to_those_of_pictures() -> None:
     assert lengths == pytest.approx([0.08, 0.04, 0.02, 0.02], rel=1e-4)
 
 
+def test_training_splits_what_is_seen_once_intervals_have_their_length() -> None:
+    sampler, rays = small(coarse_step=0.04, coarse_until=0.5, splits=4, min_weight=1e-4), rays_towards_origin(20)
+
+    def length() -> float:
+        return float(sampler(rays, fog(1.0), generator=torch.Generator().manual_seed(0)).lengths.median())
+
+    for progress, expected in ((0.0, 0.04), (0.49, 0.0203), (0.5, 0.005), (1.0, 0.005)):
+        sampler.train().set_progress(progress)
+        assert length() == pytest.approx(expected, rel=1e-2)
+        sampler.eval()
+        assert length() == pytest.approx(0.005, rel=1e-3)
+
+
+def test_pictures_ask_where_something_is_seen_at_short_intervals() -> None:
+    """The picture of long marched intervals, split, is that of short ones, up to what the filter leaves out."""
+    camera = Camera(Intrinsics(24, 24, 30.0, 30.0), look_at([0.0, -3.0, 0.5], [0.0, 0.0, 0.0]))
+    asked: list[int] = []
+
+    class Counting(MovingBall):
+        def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+            asked.append(len(times))
+            return super().forward(positions, directions, times)
+
+    opacities, counts = [], []
+    for splits in (1, 5):
+        sampler = OccupancySampler(BOX, 0.01 * splits, 16, num_slabs=8, splits=splits, min_weight=1e-4, pad_to=1)
+        sampler.fill(MovingBall())
+        renderer = Renderer(Counting(), sampler, stop_transmittance=1e-4)
+        opacities.append(renderer.render_image(camera, 0.4).opacity)
+        counts.append(sum(asked))
+        asked.clear()
+    assert counts[1] < 0.6 * counts[0]
+    difference = (opacities[1] - opacities[0]).abs()
+    # At an edge the two march through other intervals; elsewhere both see an opaque ball.
+    assert difference.quantile(0.95) < 1e-3
+    assert difference.mean() < 0.01
+
+
 def test_cells_can_be_set() -> None:
     sampler = small(render_margin=0)
     sampler.occupy(torch.tensor(False))
@@ -201,6 +240,7 @@ def test_grid_is_saved_with_the_model() -> None:
         ({"render_margin": 2}, "render_margin must be 0 or 1"),
         ({"coarse_step": 0.0}, "coarse_step must be > 0"),
         ({"coarse_until": 1.5}, r"coarse_until must be in \(0, 1\]"),
+        ({"splits": 0}, "splits must be > 0"),
         ({"narrow_from": 1.5}, r"narrow_from must be in \[0, 1\]"),
         ({"filter_joins": 0}, "filter_joins must be > 0"),
     ],
