@@ -17,6 +17,7 @@ from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 from dnerf.samplers.visibility import PackedRounds, Source, walk_front_to_back
+from dnerf.tracing import FrameTracer
 
 logger = logging.getLogger(__name__)
 
@@ -100,21 +101,30 @@ class Renderer(nn.Module):
         )
         return Rendering(**{**vars(rendering), "proposals": proposals})
 
-    def _without_gradients(self, rays: Rays, field: RadianceField) -> Rendering:
-        """What `forward` shows of a field, without per-sample data: rays end where they are opaque."""
-        ends_early = self.stop_transmittance > 0 and self.quadrature == "constant"
-        source = self._marched(rays) if ends_early else None
+    def _without_gradients(self, rays: Rays, field: RadianceField, tracer: FrameTracer | None = None) -> Rendering:
+        """What `forward` shows of a field, without per-sample data: rays end where they are opaque.
+
+        Args:
+            rays: R rays.
+            field: what is rendered.
+            tracer: shows what it can of them.
+        """
         numbers = torch.arange(len(rays), device=rays.near.device)
+        sums = rays.origins.new_zeros(len(rays), 5)
+        source = self._marched(rays) if self._ends_early else None
+        if source is not None and tracer is not None:
+            with self.autocast(rays.origins.device):
+                sums, is_done = tracer(rays)
+            numbers = (~is_done).nonzero()[:, 0]
         if source is None:
             with self.autocast(rays.origins.device):
                 samples = self.sampler(rays, field)
             if not samples.is_packed:
                 return self._render(rays, samples, field)
-            if not ends_early:
+            if not self._ends_early:
                 return self._render(rays, samples.padded(PAD_TO), field)
             source = packed = PackedRounds(samples, PAD_TO)
             numbers = packed.rays
-        sums = rays.origins.new_zeros(len(rays), 5)
 
         def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
             chosen = rays[ray_numbers]
@@ -130,6 +140,15 @@ class Renderer(nn.Module):
         rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
         rgb = rgb + (1 - opacity)[:, None] * self.background(rays.directions)
         return Rendering(rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity))
+
+    @property
+    def _ends_early(self) -> bool:
+        return self.stop_transmittance > 0 and self.quadrature == "constant"
+
+    def _tracer(self, field: RadianceField, time: float) -> FrameTracer | None:
+        if not self._ends_early:
+            return None
+        return FrameTracer.of(field, self.sampler.grid_at(time), time, self.stop_transmittance)
 
     def _marched(self, rays: Rays) -> Source | None:
         """Samples that are looked for only when light still gets there; None if the sampler places all at once."""
@@ -206,7 +225,8 @@ class Renderer(nn.Module):
         self.eval()
         try:
             seen = self.sampler.seen_pixels(camera, time)
-            parts = list(self._in_chunks(camera.rays(time, seen), self.field.at_time(time), chunk))
+            field = self.field.at_time(time)
+            parts = list(self._in_chunks(camera.rays(time, seen), field, chunk, self._tracer(field, time)))
             columns = [torch.cat([p.rgb, p.opacity[:, None], p.depth[:, None]], dim=-1) for p in parts]
             if seen is None:
                 picture = torch.cat(columns)
@@ -229,12 +249,14 @@ class Renderer(nn.Module):
             color = self.background(camera.rays(time).directions)
         return torch.nn.functional.pad(color, (0, 2))
 
-    def _in_chunks(self, rays: Rays, field: RadianceField, chunk: int) -> Iterator[Rendering]:
+    def _in_chunks(
+        self, rays: Rays, field: RadianceField, chunk: int, tracer: FrameTracer | None
+    ) -> Iterator[Rendering]:
         """Render so many rays at a time; half as many from where a GPU's memory does not suffice."""
         start = 0
         while start < len(rays):
             try:
-                part = self._without_gradients(rays[start : start + chunk], field)
+                part = self._without_gradients(rays[start : start + chunk], field, tracer)
             except torch.OutOfMemoryError as error:
                 if chunk == 1:
                     raise MemoryError("the GPU's memory does not suffice for one ray") from error

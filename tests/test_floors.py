@@ -28,6 +28,7 @@ FLOORS = {
     "deformations": 2,
     "fields": 3,
     "samplers": 4,
+    "tracing": 4,
     "renderer": 5,
     "scenes": 5,
     "data": 6,

@@ -58,7 +58,7 @@ class FrozenDeformation(Deformation):
         num_vertices = (lattice.cells[0] + 1) * (lattice.cells[1] + 1) * (lattice.cells[2] + 1)
         self.levels = GridLevels([lattice.cells], 1 << (num_vertices - 1).bit_length())
         self.low, self.sides = lattice.box[0], lattice.box[1] - lattice.box[0]
-        self.displacements = torch.zeros(num_vertices, 4)  # four, so that rows are aligned
+        self.displacements = torch.full((num_vertices, 4), torch.nan)  # four, so that rows are aligned
         self.is_known = torch.zeros([c + 1 for c in reversed(lattice.cells)], dtype=torch.bool)
 
     @torch.no_grad()
@@ -101,13 +101,24 @@ class FrozenDeformation(Deformation):
         for axis in range(3):
             length = needed.shape[axis] - 1
             needed.narrow(axis, 1, length).logical_or_(needed.narrow(axis, 0, length).clone())
-        places = (needed & ~self.is_known).nonzero()
+        self.fill(needed & ~self.is_known)
+
+    @torch.no_grad()
+    def fill(self, wanted: Tensor) -> bool:
+        """Ask the deformation at the vertices (Lz + 1, Ly + 1, Lx + 1) that are wanted, bool.
+
+        Returns:
+            Whether there were any.
+        """
+        places = wanted.nonzero()
         if not len(places):
-            return
+            return False
         padded = torch.cat([places, places[-1:].expand(-len(places) % self.pad_to, 3)])
+        size = torch.tensor(self.levels.cells, device=places.device)
         vertices = self.low + self.sides * padded.flip(-1) / size
         displaced = self.deformation(vertices, vertices.new_full((len(vertices),), self.time)) - vertices
         self.displacements.view(*self.is_known.shape, 4)[(*places.unbind(-1),)] = torch.nn.functional.pad(
             displaced[: len(places)].float(), (0, 1)
         )
-        self.is_known |= needed
+        self.is_known |= wanted
+        return True

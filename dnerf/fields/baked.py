@@ -92,6 +92,10 @@ class BakedField(RadianceField):
         """As the field it stands for."""
         return self.field.from_contents(contents, times)
 
+    def series_at(self, time: float) -> tuple[Tensor, float] | None:
+        """As of the field it stands for."""
+        return self.field.series_at(time)
+
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at positions (..., 3) and times (...,)."""
         return self(positions, positions, times).density
@@ -122,14 +126,7 @@ class BakedField(RadianceField):
         if self.is_full:
             return found
         missing = self._missing(cells[~found[1]])
-        if not len(missing):
-            return found
-        if self.num_bricks + len(missing) > self.max_bricks:
-            logger.warning("baking: no room for more than %d bricks, the field is asked itself", self.max_bricks)
-            self.is_full = True
-            return found
-        self._make(missing)
-        return brick_lookup(cells, self.slots, self.bricks)
+        return brick_lookup(cells, self.slots, self.bricks) if self.make(missing) else found
 
     def _to(self, device: torch.device) -> None:
         if self.slots.device != device:
@@ -143,7 +140,19 @@ class BakedField(RadianceField):
         is_wanted[torch.minimum(cells.long() // BRICK, shape - 1).unbind(-1)] = True
         return (is_wanted & (self.slots < 0)).nonzero()
 
-    def _make(self, missing: Tensor) -> None:
+    @torch.no_grad()
+    def make(self, missing: Tensor) -> bool:
+        """Make the bricks at places (K, 3) among those of the box, all or, if there is no room, none.
+
+        Returns:
+            Whether any were made.
+        """
+        if not len(missing) or self.is_full:
+            return False
+        if self.num_bricks + len(missing) > self.max_bricks:
+            logger.warning("baking: no room for more than %d bricks, the field is asked itself", self.max_bricks)
+            self.is_full = True
+            return False
         side = torch.arange(BRICK + 1, device=missing.device)
         vertices = torch.cartesian_prod(side, side, side)
         end = self.num_bricks + len(missing)
@@ -156,6 +165,7 @@ class BakedField(RadianceField):
             self.bricks[number] = values[: len(part)]
         self.slots[missing.unbind(-1)] = numbers
         self.num_bricks = end
+        return True
 
     def _make_room(self, count: int) -> None:
         """Room for so many bricks; if there was less, for twice as many as before at least."""

@@ -61,6 +61,15 @@ class RadianceField(nn.Module, ABC):
         """
         raise self._without_contents()
 
+    def series_at(self, time: float) -> tuple[Tensor, float] | None:
+        """How contents add up at a time in [0, 1], if they are 4 K terms of density, red, green and blue in turn.
+
+        Returns:
+            Factors w (K,) and a shift s such that density is `exp(min(w . terms + s, 15))` and a colour
+            `sigmoid(w . terms)`; None for a field that shows its contents in another way, or has none.
+        """
+        return None
+
     def finished(self) -> "RadianceField":
         """The field to ask once nothing is learnt any more; itself, unless something can be kept between frames."""
         return self

@@ -132,12 +132,22 @@ class GridField(RadianceField):
         if self.time_terms == 1:
             return series
         dtype = torch.promote_types(torch.promote_types(series.dtype, times.dtype), torch.float32)
-        waves = torch.cos(math.pi * self.orders.to(dtype) * times[..., None].to(dtype))
+        waves = self._waves(times.to(dtype))
         terms = series.to(dtype).unflatten(-1, (-1, self.time_terms))
         if times.ndim:
             return (terms * waves[..., None, :]).sum(-1)
         with torch.autocast(terms.device.type, enabled=False):
             return terms @ waves
+
+    def _waves(self, times: Tensor) -> Tensor:
+        """The series' cosines (..., K) at times (...,)."""
+        return torch.cos(math.pi * self.orders.to(times.dtype) * times[..., None])
+
+    def series_at(self, time: float) -> tuple[Tensor, float] | None:
+        """Its cosines and `density_shift`; None if the density is no exponential."""
+        if not self.num_contents or self.density_activation != "exp":
+            return None
+        return self._waves(torch.tensor(time, device=self.orders.device)), self.density_shift
 
     def contents(self, positions: Tensor) -> Tensor:
         """The head's outputs (..., 4 K) at canonical positions (..., 3)."""

@@ -3,14 +3,17 @@
 from .backend import BACKENDS, get_backend, set_backend, use_backend
 from .brick_lookup import brick_lookup
 from .grid_encode import GridLevels, grid_encode
-from .march import MarchedSamples, march
+from .march import MarchedSamples, MarchGrid, march
 from .packed_sum import packed_sum
 from .packed_weights import packed_weights
 from .skip_distances import skip_distances
+from .trace import FrameTables, trace
 
 __all__ = [
     "BACKENDS",
+    "FrameTables",
     "GridLevels",
+    "MarchGrid",
     "MarchedSamples",
     "brick_lookup",
     "get_backend",
@@ -20,5 +23,6 @@ __all__ = [
     "packed_weights",
     "set_backend",
     "skip_distances",
+    "trace",
     "use_backend",
 ]

@@ -25,6 +25,24 @@ class MarchedSamples(NamedTuple):
     offsets: Tensor
 
 
+class MarchGrid(NamedTuple):
+    """What rays of one time are marched through.
+
+    Attributes:
+        occupancy: (Gx, Gy, Gz) bool.
+        skips: `skip_distances` of it, without the axis of slabs.
+        aabb: (2, 3), lower and upper corner of the box that the cells fill, in world units.
+        step: length of an interval, in world units.
+        splits: parts into which those in which something is seen are cut.
+    """
+
+    occupancy: Tensor
+    skips: Tensor
+    aabb: Tensor
+    step: float
+    splits: int = 1
+
+
 @torch.no_grad()
 def march(
     origins: Tensor,
@@ -107,6 +125,25 @@ def march_reference(
 
     The compiled versions round like this one, operation by operation, and so return the same bits.
     """
+    starts, ends, keep = kept_intervals(origins, directions, near, far, times, jitter, occupancy, aabb, step)
+    if max_samples_per_ray is not None:
+        keep &= keep.cumsum(-1) <= max_samples_per_ray
+    offsets = torch.nn.functional.pad(keep.sum(-1).cumsum(0), (1, 0))
+    return MarchedSamples(starts[keep], ends[keep], keep.nonzero()[:, 0], offsets)
+
+
+def kept_intervals(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    occupancy: Tensor,
+    aabb: Tensor,
+    step: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Start and end of every interval that a ray may have, and which are kept, (R, J) each."""
     enter, leave, first, counts = interval_ranges(origins, directions, near, far, jitter, aabb, step)
     num_intervals = int(counts.max()) if len(counts) else 0
     index = first[:, None] + torch.arange(num_intervals, device=near.device).to(near.dtype)
@@ -120,10 +157,7 @@ def march_reference(
     cells = cells.floor().long().clamp(min=torch.zeros_like(shape), max=shape - 1)
     slabs = (times * occupancy.shape[0]).long().clamp(0, occupancy.shape[0] - 1)
     keep = (counts > 0)[:, None] & (ends > starts) & occupancy[(slabs[:, None], *cells.unbind(-1))]
-    if max_samples_per_ray is not None:
-        keep &= keep.cumsum(-1) <= max_samples_per_ray
-    offsets = torch.nn.functional.pad(keep.sum(-1).cumsum(0), (1, 0))
-    return MarchedSamples(starts[keep], ends[keep], keep.nonzero()[:, 0], offsets)
+    return starts, ends, keep
 
 
 def interval_ranges(

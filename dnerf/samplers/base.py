@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from dnerf.cameras import Camera
 from dnerf.fields.base import RadianceField
+from dnerf.kernels import MarchGrid
 from dnerf.rays import Rays, Samples
 
 
@@ -65,6 +66,13 @@ class Sampler(nn.Module, ABC):
 
         Returns:
             Their numbers (P,) int64, `row * width + column`, in order; None for all.
+        """
+        return None
+
+    def grid_at(self, time: float) -> MarchGrid | None:
+        """The cells of which evaluation mode keeps the intervals of `march`, at a time in [0, 1].
+
+        None from a sampler that places samples otherwise (unless overridden).
         """
         return None
 

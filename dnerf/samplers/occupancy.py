@@ -10,7 +10,7 @@ from dnerf.checks import as_box, check_positive
 from dnerf.compositing import render_weights
 from dnerf.fields.base import RadianceField
 from dnerf.geometry import cube_corners
-from dnerf.kernels import march, skip_distances
+from dnerf.kernels import MarchGrid, march, skip_distances
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 from dnerf.samplers.masks import slab_halves, widened
@@ -217,6 +217,15 @@ class OccupancySampler(Sampler):
         """Share of the cells that pictures look into."""
         return float((self.occupied if self.rendered is None else self.rendered).float().mean())
 
+    def grid_at(self, time: float) -> MarchGrid:
+        """The slab that pictures of a time look into."""
+        occupied, skips = self.occupied, self.skips
+        if self.rendered is not None and self.rendered_skips is not None:
+            occupied, skips = self.rendered, self.rendered_skips
+        slab = int(torch.tensor(time, dtype=self.box.dtype) * len(occupied))  # rounds as times of rays do
+        slab = min(slab, len(occupied) - 1)
+        return MarchGrid(occupied[slab], skips[slab], self.box, self.step_size, self.splits)
+
     @torch.no_grad()
     def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
         """Pixels inside the rectangles that occupied cells cover on the picture; all if a cell lies beside the camera.
@@ -224,10 +233,7 @@ class OccupancySampler(Sampler):
         So a frame costs what the body covers, not what the picture holds. No pixel is lost: cells are convex, so the
         rectangle around a cell's corners holds all of it.
         """
-        occupied = self.occupied if self.rendered is None else self.rendered
-        num_slabs = len(occupied)
-        slab = int(torch.tensor(time, dtype=camera.pose.dtype) * num_slabs)  # rounds as times of rays do
-        lowest = occupied[min(slab, num_slabs - 1)].nonzero()
+        lowest = self.grid_at(time).occupancy.nonzero()
         unit = (lowest[:, None] + cube_corners(lowest.device)) / self.shape[1:]
         return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
 

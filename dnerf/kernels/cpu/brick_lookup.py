@@ -9,7 +9,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..brick_lookup import BRICK, BRICK_BITS, VERTICES
-from .launch import FAST, launch
+from .launch import BORROWS, FAST, launch
 from .rows import blend_rows
 
 SIDE = BRICK + 1
@@ -25,25 +25,53 @@ def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tens
     return values, known
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
-def _lookup(positions: Any, slots: Any, table: Any, values: Any, known: Any, lanes: Any) -> None:
+@njit(fastmath=FAST, **BORROWS)
+def is_inside(px: Any, py: Any, pz: Any, slots: Any) -> bool:
+    """Whether a place, in cells, lies in the lattice."""
     bx, by, bz = slots.shape
-    one, zero = positions.dtype.type(1), positions.dtype.type(0)
+    zero = type(px)(0)
+    return px >= zero and py >= zero and pz >= zero and px <= bx * BRICK and py <= by * BRICK and pz <= bz * BRICK
+
+
+@njit(fastmath=FAST, **BORROWS)
+def cell_of(px: Any, py: Any, pz: Any, slots: Any) -> Any:
+    """The cell (x, y, z) of a place in the lattice."""
+    bx, by, bz = slots.shape
+    return min(int(px), bx * BRICK - 1), min(int(py), by * BRICK - 1), min(int(pz), bz * BRICK - 1)
+
+
+@njit(fastmath=FAST, **BORROWS)
+def first_row(x: int, y: int, z: int, number: int) -> Any:
+    """Row of the lowest vertex of a cell, in the brick of that number."""
+    x, y, z = x & (BRICK - 1), y & (BRICK - 1), z & (BRICK - 1)
+    return np.int64(number * VERTICES + (x * SIDE + y) * SIDE + z)
+
+
+@njit(fastmath=FAST, **BORROWS)
+def corner_rows(a: int) -> Any:
+    """Rows of the eight vertices of a cell, from that of the lowest; bit 0 of the vertex number is z, bit 2 x."""
+    b, c = a + SIDE, a + SIDE * SIDE
+    d = c + SIDE
+    return a, a + 1, b, b + 1, c, c + 1, d, d + 1
+
+
+@njit(fastmath=FAST, **BORROWS)
+def corner_weights(u: Any, v: Any, w: Any) -> Any:
+    """Trilinear weights of the eight vertices, in the order of `corner_rows`, at fractions of the cell."""
+    one = type(u)(1)
+    e, f, g, h = (one - u) * (one - v), (one - u) * v, u * (one - v), u * v
+    return e * (one - w), e * w, f * (one - w), f * w, g * (one - w), g * w, h * (one - w), h * w
+
+
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+def _lookup(positions: Any, slots: Any, table: Any, values: Any, known: Any, lanes: Any) -> None:
     for i in prange(positions.shape[0]):
         px, py, pz = positions[i]
-        if px >= zero and py >= zero and pz >= zero and px <= bx * BRICK and py <= by * BRICK and pz <= bz * BRICK:
-            x, y, z = min(int(px), bx * BRICK - 1), min(int(py), by * BRICK - 1), min(int(pz), bz * BRICK - 1)
+        if is_inside(px, py, pz, slots):
+            x, y, z = cell_of(px, py, pz, slots)
             number = slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS]
             if number >= 0:
                 known[i] = True
-                u = px - positions.dtype.type(x)
-                v = py - positions.dtype.type(y)
-                w = pz - positions.dtype.type(z)
-                x, y, z = x & (BRICK - 1), y & (BRICK - 1), z & (BRICK - 1)
-                a = np.int64(number * VERTICES + (x * SIDE + y) * SIDE + z)
-                b, c = a + SIDE, a + SIDE * SIDE
-                d = c + SIDE
-                rows = (a, a + 1, b, b + 1, c, c + 1, d, d + 1)
-                e, f, g, h = (one - u) * (one - v), (one - u) * v, u * (one - v), u * v
-                weights = (e * (one - w), e * w, f * (one - w), f * w, g * (one - w), g * w, h * (one - w), h * w)
-                blend_rows(table, rows, weights, values, i * len(lanes), lanes)
+                real = positions.dtype.type
+                weights = corner_weights(px - real(x), py - real(y), pz - real(z))
+                blend_rows(table, corner_rows(first_row(x, y, z, number)), weights, values, i * len(lanes), lanes)

@@ -10,7 +10,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..grid_encode import GridLevels
-from .launch import FAST, launch, num_threads
+from .launch import BORROWS, FAST, launch, num_threads
 from .rows import add_to_row, blend_rows, dot_slopes
 
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
@@ -65,8 +65,8 @@ def _levels(cells: tuple[int, ...], max_rows: int) -> np.ndarray:
     return np.array(GridLevels(triples, max_rows).describe(), dtype=np.int64)
 
 
-@njit(fastmath=FAST)
-def _locate(position: Any, num_cells: int) -> Any:
+@njit(fastmath=FAST, **BORROWS)
+def locate(position: Any, num_cells: int) -> Any:
     """Lower vertex and fraction along one axis. A NaN gives vertex 0 and fraction NaN, never a wild index."""
     one = type(position)(1)
     zero = type(position)(0)
@@ -76,7 +76,7 @@ def _locate(position: Any, num_cells: int) -> Any:
     return lower, scaled - type(position)(lower)
 
 
-@njit(fastmath=FAST)
+@njit(fastmath=FAST, **BORROWS)
 def _rows(x: int, y: int, z: int, level: Any) -> Any:
     """Table rows of the 8 vertices of a cell; bit 0 of the vertex number is x, bit 1 y, bit 2 z."""
     offset, mask = level[3], level[4]
@@ -100,27 +100,27 @@ def _rows(x: int, y: int, z: int, level: Any) -> Any:
     )
 
 
-@njit(fastmath=FAST)
-def _weights(u: Any, v: Any, w: Any) -> Any:
+@njit(fastmath=FAST, **BORROWS)
+def trilinear_weights(u: Any, v: Any, w: Any) -> Any:
     """Trilinear weights of the 8 vertices, in the order of `_rows`."""
     one = type(u)(1)
     a, b, c, d = (one - v) * (one - w), v * (one - w), (one - v) * w, v * w
     return (one - u) * a, u * a, (one - u) * b, u * b, (one - u) * c, u * c, (one - u) * d, u * d
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
 def _forward(positions: Any, table: Any, levels: Any, out: Any, lanes: Any) -> None:
     for i in prange(positions.shape[0]):
         for j in range(levels.shape[0]):
             level = levels[j]
-            x, u = _locate(positions[i, 0], level[0])
-            y, v = _locate(positions[i, 1], level[1])
-            z, w = _locate(positions[i, 2], level[2])
+            x, u = locate(positions[i, 0], level[0])
+            y, v = locate(positions[i, 1], level[1])
+            z, w = locate(positions[i, 2], level[2])
             start = i * out.shape[1] + j * len(lanes)
-            blend_rows(table, _rows(x, y, z, level), _weights(u, v, w), out, start, lanes)
+            blend_rows(table, _rows(x, y, z, level), trilinear_weights(u, v, w), out, start, lanes)
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
 def _grad_table(grad: Any, positions: Any, levels: Any, part_bits: int, num_workers: int, out: Any, lanes: Any) -> None:
     """Scatter-add without atomics: a task owns one level, or every 2^part_bits-th block of its rows.
 
@@ -133,27 +133,27 @@ def _grad_table(grad: Any, positions: Any, levels: Any, part_bits: int, num_work
             level = levels[task >> part_bits]
             part = task & part_mask
             for i in range(positions.shape[0]):
-                x, u = _locate(positions[i, 0], level[0])
-                y, v = _locate(positions[i, 1], level[1])
-                z, w = _locate(positions[i, 2], level[2])
+                x, u = locate(positions[i, 0], level[0])
+                y, v = locate(positions[i, 1], level[1])
+                z, w = locate(positions[i, 2], level[2])
                 rows = _rows(x, y, z, level)
-                weights = _weights(u, v, w)
+                weights = trilinear_weights(u, v, w)
                 start = i * grad.shape[1] + (task >> part_bits) * len(lanes)
                 for k in range(8):
                     if part_bits == 0 or (rows[k] >> ROW_BLOCK_BITS) & part_mask == part:
                         add_to_row(out, rows[k], weights[k], grad, start, lanes)
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
 def _grad_positions(grad: Any, positions: Any, table: Any, levels: Any, out: Any, lanes: Any) -> None:
     one, zero = positions.dtype.type(1), positions.dtype.type(0)
     for i in prange(positions.shape[0]):
         grad_x, grad_y, grad_z = zero, zero, zero
         for j in range(levels.shape[0]):
             level = levels[j]
-            x, u = _locate(positions[i, 0], level[0])
-            y, v = _locate(positions[i, 1], level[1])
-            z, w = _locate(positions[i, 2], level[2])
+            x, u = locate(positions[i, 0], level[0])
+            y, v = locate(positions[i, 1], level[1])
+            z, w = locate(positions[i, 2], level[2])
             rows = _rows(x, y, z, level)
             start = i * grad.shape[1] + j * len(lanes)
             along_x, along_y, along_z = dot_slopes(table, rows, (u, v, w), grad, start, lanes)

@@ -20,6 +20,10 @@ if "NUMBA_THREADING_LAYER" not in os.environ and "NUMBA_THREADING_LAYER_PRIORITY
 # No assumption that values are finite: NaN and inf keep their meaning.
 FAST = {"contract", "nsz"}
 
+# numba counts references to arrays at every call between compiled functions, atomically, which can take longer than
+# the call. Functions that only look at arrays which somebody else holds, and make none, do without.
+BORROWS: dict[str, Any] = {"_nrt": False}
+
 
 def num_threads() -> int:
     """Threads a kernel started now may use: torch's number, as far as numba has started so many."""

@@ -10,7 +10,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..skip_distances import BLOCK_BITS
-from .launch import launch
+from .launch import BORROWS, launch
 from .rows import trailing_zeros
 from .skip_distances import skip_distances
 
@@ -34,7 +34,7 @@ def march(
     size = o.dtype.type(step)
     ranges = np.empty((len(o), 3), o.dtype)
     counts = np.empty(len(o), np.int64)
-    launch(_ranges, o, d, t0, t1, jitter_, box, size, ranges, counts)
+    launch(ray_ranges, o, d, t0, t1, jitter_, box, size, ranges, counts)
 
     kept = np.zeros((len(o), (counts.max(initial=0) + 63) // 64), np.uint64)
     offsets = torch.zeros(len(o) + 1, dtype=torch.int64)
@@ -44,7 +44,7 @@ def march(
         skips = skip_distances(occupancy)
     reach = skips.contiguous().numpy()
     bounds = np.empty((len(grid), 3, 2), np.int64)
-    launch(_bounds, reach, bounds)
+    launch(block_bounds, reach, bounds)
     arguments = (o, d, t0, times_, jitter_, grid, reach, bounds, box, size, limit, ranges, counts)
     launch(_mark, *arguments, kept, offsets.numpy())
     torch.cumsum(offsets, 0, out=offsets)
@@ -58,8 +58,8 @@ def march(
 
 
 # No fast-math in this file: intervals and cells must round like those of the definition.
-@njit(parallel=True, cache=True, nogil=True)
-def _ranges(
+@njit(parallel=True, cache=True, nogil=True, **BORROWS)
+def ray_ranges(
     origins: Any,
     directions: Any,
     near: Any,
@@ -91,7 +91,7 @@ def _ranges(
         counts[r] = math.ceil(length / step) + 3 if hit else 0
 
 
-@njit
+@njit(**BORROWS)
 def _interval(near: Any, jitter: Any, step: Any, enter: Any, leave: Any, index: Any) -> Any:
     one = type(near)(1)
     start = near + (index - one + jitter) * step
@@ -99,8 +99,8 @@ def _interval(near: Any, jitter: Any, step: Any, enter: Any, leave: Any, index: 
     return max(start, enter), min(end, leave)
 
 
-@njit(parallel=True, cache=True, nogil=True)
-def _bounds(skips: Any, bounds: Any) -> None:
+@njit(parallel=True, cache=True, nogil=True, **BORROWS)
+def block_bounds(skips: Any, bounds: Any) -> None:
     """Per slab and axis: the first block with an occupied cell and the one after the last; empty where none is."""
     nk, bx, by, bz = skips.shape
     for k in prange(nk):
@@ -114,7 +114,7 @@ def _bounds(skips: Any, bounds: Any) -> None:
                             bounds[k, axis, 1] = max(bounds[k, axis, 1], block + 1)
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", **BORROWS)
 def _clip(near: Any, far: Any, position: Any, speed: Any, margin: Any, bounds: Any, size: int) -> Any:
     """The part of [near, far] in which `position + speed t` may lie, on one axis, in the cells of the bounds."""
     dtype = type(position)
@@ -129,7 +129,7 @@ def _clip(near: Any, far: Any, position: Any, speed: Any, margin: Any, bounds: A
     return max(near, min(a, b)), min(far, max(a, b))
 
 
-@njit(parallel=True, cache=True, nogil=True)
+@njit(parallel=True, cache=True, nogil=True, **BORROWS)
 def _mark(
     origins: Any,
     directions: Any,
@@ -154,66 +154,128 @@ def _mark(
     Midpoints round monotonically, and so do the cells computed from them; the margins exceed the rounding of the
     distance to where the empty blocks end. So the result is that of testing every interval.
     """
-    dtype = near.dtype.type
-    half, rounding = dtype(0.5), dtype(8) * dtype(np.finfo(dtype).eps)
-    num_slabs = occupancy.shape[0]
-    nx, ny, nz = occupancy.shape[1:]
-    scale_x = dtype(nx) / (aabb[1, 0] - aabb[0, 0])
-    scale_y = dtype(ny) / (aabb[1, 1] - aabb[0, 1])
-    scale_z = dtype(nz) / (aabb[1, 2] - aabb[0, 2])
     for r in prange(len(near)):
-        enter, leave, first = ranges[r]
-        slab = min(max(int(times[r] * dtype(num_slabs)), 0), num_slabs - 1)
-        ox, oy, oz = origins[r]
-        dx, dy, dz = directions[r]
-        margin_x = _margin(rounding, ox, dx, aabb[0, 0], scale_x, leave, nx)
-        margin_y = _margin(rounding, oy, dy, aabb[0, 1], scale_y, leave, ny)
-        margin_z = _margin(rounding, oz, dz, aabb[0, 2], scale_z, leave, nz)
-        slack = rounding * max(abs(near[r]), abs(leave)) + dtype(1e-3) * step
-        begin, finish = enter, leave
-        u, v, w = (ox - aabb[0, 0]) * scale_x, (oy - aabb[0, 1]) * scale_y, (oz - aabb[0, 2]) * scale_z
-        begin, finish = _clip(begin, finish, u, dx * scale_x, margin_x, bounds[slab, 0], nx)
-        begin, finish = _clip(begin, finish, v, dy * scale_y, margin_y, bounds[slab, 1], ny)
-        begin, finish = _clip(begin, finish, w, dz * scale_z, margin_z, bounds[slab, 2], nz)
-        if not begin - slack <= finish + slack:
-            offsets[r + 1] = 0
-            continue
-        # An interval's middle lies within half a step of its place, also where it is clipped.
-        base = near[r] + (first + jitter[r]) * step
+        slab = min(max(int(times[r] * near.dtype.type(occupancy.shape[0])), 0), occupancy.shape[0] - 1)
+        j, count, course = course_of(
+            origins[r],
+            directions[r],
+            near[r],
+            jitter[r],
+            step,
+            ranges[r],
+            counts[r],
+            occupancy[slab],
+            bounds[slab],
+            aabb,
+        )
         found = 0
-        j = max(int((begin - slack - base) / step) - 1, 0)
-        count = min(counts[r], max(int((finish + slack - base) / step), 0) + 3)
-        while j < count and found < limit:
-            index = first + dtype(j)
-            start, end = _interval(near[r], jitter[r], step, enter, leave, index)
-            middle = (start + end) * half
-            u = (ox + dx * middle - aabb[0, 0]) * scale_x
-            v = (oy + dy * middle - aabb[0, 1]) * scale_y
-            w = (oz + dz * middle - aabb[0, 2]) * scale_z
-            x, y, z = min(max(int(u), 0), nx - 1), min(max(int(v), 0), ny - 1), min(max(int(w), 0), nz - 1)
-            radius = int(skips[slab, x >> BLOCK_BITS, y >> BLOCK_BITS, z >> BLOCK_BITS])
-            if radius == 0:
-                if end > start and occupancy[slab, x, y, z]:
-                    kept[r, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
-                    found += 1
-                j += 1
-            else:
-                free = leave - middle
-                free = min(free, _free(u, x, radius, dx * scale_x, margin_x))
-                free = min(free, _free(v, y, radius, dy * scale_y, margin_y))
-                free = min(free, _free(w, z, radius, dz * scale_z, margin_z))
-                edge = near[r] + (index + jitter[r]) * step
-                j += 1 + max(int((middle + free - slack - edge) / step + half), 0)
+        while found < limit:
+            j, _, _ = next_kept(j, count, course, occupancy[slab], skips[slab])
+            if j >= count:
+                break
+            kept[r, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
+            found += 1
+            j += 1
         offsets[r + 1] = found
 
 
-@njit
+@njit(**BORROWS)
+def course_of(
+    origin: Any,
+    direction: Any,
+    near: Any,
+    jitter: Any,
+    step: Any,
+    span: Any,
+    count: Any,
+    occupancy: Any,
+    bounds: Any,
+    aabb: Any,
+) -> Any:
+    """The first interval that may be kept, the one after the last, and what `next_kept` has to know of a ray.
+
+    Args:
+        origin, direction, near, jitter: the ray's.
+        step: length of an interval.
+        span: entry, exit and number of the first interval, see `ray_ranges`.
+        count: how many intervals there may be.
+        occupancy: (Gx, Gy, Gz), the ray's slab.
+        bounds: (3, 2), the slab's, see `block_bounds`.
+        aabb: (2, 3) box of the grid.
+    """
+    dtype = type(near)
+    rounding = dtype(8) * dtype(np.finfo(dtype).eps)
+    nx, ny, nz = occupancy.shape
+    enter, leave, first = span
+    ox, oy, oz = origin
+    dx, dy, dz = direction
+    scale_x = dtype(nx) / (aabb[1, 0] - aabb[0, 0])
+    scale_y = dtype(ny) / (aabb[1, 1] - aabb[0, 1])
+    scale_z = dtype(nz) / (aabb[1, 2] - aabb[0, 2])
+    margin_x = _margin(rounding, ox, dx, aabb[0, 0], scale_x, leave, nx)
+    margin_y = _margin(rounding, oy, dy, aabb[0, 1], scale_y, leave, ny)
+    margin_z = _margin(rounding, oz, dz, aabb[0, 2], scale_z, leave, nz)
+    slack = rounding * max(abs(near), abs(leave)) + dtype(1e-3) * step
+    course = (
+        (ox, oy, oz),
+        (dx, dy, dz),
+        (aabb[0, 0], aabb[0, 1], aabb[0, 2]),
+        (scale_x, scale_y, scale_z),
+        (margin_x, margin_y, margin_z),
+        (near, jitter, step, enter, leave, first, slack),
+    )
+    begin, finish = enter, leave
+    u, v, w = (ox - aabb[0, 0]) * scale_x, (oy - aabb[0, 1]) * scale_y, (oz - aabb[0, 2]) * scale_z
+    begin, finish = _clip(begin, finish, u, dx * scale_x, margin_x, bounds[0], nx)
+    begin, finish = _clip(begin, finish, v, dy * scale_y, margin_y, bounds[1], ny)
+    begin, finish = _clip(begin, finish, w, dz * scale_z, margin_z, bounds[2], nz)
+    if not begin - slack <= finish + slack:
+        return 0, 0, course
+    # An interval's middle lies within half a step of its place, also where it is clipped.
+    base = near + (first + jitter) * step
+    j = max(int((begin - slack - base) / step) - 1, 0)
+    return j, min(int(count), max(int((finish + slack - base) / step), 0) + 3), course
+
+
+@njit(**BORROWS)
+def next_kept(j: int, count: int, course: Any, occupancy: Any, skips: Any) -> Any:
+    """The first kept interval from number j on, and its ends; a number of at least `count` if there is none."""
+    origin, direction, low, scale, margin, along = course
+    near, jitter, step, enter, leave, first, slack = along
+    dtype = type(near)
+    half = dtype(0.5)
+    nx, ny, nz = occupancy.shape
+    start, end = near, near
+    while j < count:
+        index = first + dtype(j)
+        start, end = _interval(near, jitter, step, enter, leave, index)
+        middle = (start + end) * half
+        u = (origin[0] + direction[0] * middle - low[0]) * scale[0]
+        v = (origin[1] + direction[1] * middle - low[1]) * scale[1]
+        w = (origin[2] + direction[2] * middle - low[2]) * scale[2]
+        x, y, z = min(max(int(u), 0), nx - 1), min(max(int(v), 0), ny - 1), min(max(int(w), 0), nz - 1)
+        radius = int(skips[x >> BLOCK_BITS, y >> BLOCK_BITS, z >> BLOCK_BITS])
+        if radius == 0:
+            if end > start and occupancy[x, y, z]:
+                break
+            j += 1
+        else:
+            free = leave - middle
+            free = min(free, _free(u, x, radius, direction[0] * scale[0], margin[0]))
+            free = min(free, _free(v, y, radius, direction[1] * scale[1], margin[1]))
+            free = min(free, _free(w, z, radius, direction[2] * scale[2], margin[2]))
+            edge = near + (index + jitter) * step
+            j += 1 + max(int((middle + free - slack - edge) / step + half), 0)
+    return j, start, end
+
+
+@njit(**BORROWS)
 def _margin(rounding: Any, o: Any, d: Any, lower: Any, scale: Any, leave: Any, size: int) -> Any:
     """A bound on the rounding of a position inside the box, in cells of one axis."""
     return rounding * (type(o)(size) + scale * (abs(o) + abs(lower) + abs(d) * abs(leave)))
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", **BORROWS)
 def _free(position: Any, cell: int, radius: int, speed: Any, margin: Any) -> Any:
     """Distance along the ray that surely stays, on one axis, within the blocks closer than `radius`."""
     dtype = type(position)
@@ -227,7 +289,7 @@ def _free(position: Any, cell: int, radius: int, speed: Any, margin: Any) -> Any
     return max(cells - margin, dtype(0)) / abs(speed)
 
 
-@njit(parallel=True, cache=True, nogil=True)
+@njit(parallel=True, cache=True, nogil=True, **BORROWS)
 def _fill(
     near: Any,
     jitter: Any,

@@ -57,6 +57,25 @@ def blend_rows(typing: Any, table: Any, rows: Any, weights: Any, out: Any, start
 
 
 @intrinsic
+def prefetch_row(typing: Any, table: Any, row: Any) -> tuple[Any, Any]:
+    """Ask for the memory in which a row begins; it is read later."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(table)(context, builder, arguments[0])
+        width = builder.extract_value(array.shape, 1)
+        byte = ir.IntType(8).as_pointer()
+        pointer = builder.bitcast(builder.gep(array.data, [builder.mul(arguments[1], width)]), byte)
+        flag = ir.IntType(32)
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag]), "llvm.prefetch.p0"
+        )
+        builder.call(function, [pointer, flag(0), flag(3), flag(1)])  # to read, to keep, data
+        return context.get_dummy_value()
+
+    return types.void(table, row), generate
+
+
+@intrinsic
 def add_to_row(typing: Any, table: Any, row: Any, weight: Any, values: Any, start: Any, lanes: Any) -> tuple[Any, Any]:
     """table[row] += weight * values.flat[start : start + F]."""
     width = lanes.count

@@ -1,0 +1,333 @@
+# mypy: disable-error-code="call-arg,var-annotated"
+"""numba version of `trace`."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from ..brick_lookup import BRICK_BITS, VERTICES
+from ..trace import DONE, ELSEWHERE, LACKS_BRICK, LACKS_VERTEX, LOOK_AHEAD, MOST_LOG_DENSITY
+from .brick_lookup import SIDE, cell_of, corner_rows, corner_weights, first_row, is_inside
+from .grid_encode import locate, trilinear_weights
+from .launch import BORROWS, FAST, launch, num_threads
+from .march import block_bounds, course_of, next_kept, ray_ranges
+from .rows import blend_rows, prefetch_row
+
+RAYS_AT_ONCE = 64  # neighbours, dealt out to threads in turn: matter fills the middle of a picture
+SAMPLES_AT_ONCE = 8  # of a ray: while one is waiting for memory, the others are
+FOUR = (0, 0, 0, 0)
+GOES_ON = 0  # between what ends a ray and what it may lack
+
+
+def trace(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    states: Tensor,
+    numbers: Tensor,
+    occupancy: Tensor,
+    skips: Tensor,
+    aabb: Tensor,
+    displacements: Tensor,
+    is_known: Tensor,
+    low: Tensor,
+    sides: Tensor,
+    slots: Tensor,
+    bricks: Tensor,
+    brick_low: Tensor,
+    waves: Tensor,
+    step: float,
+    splits: int,
+    min_weight: float,
+    cells_per_unit: float,
+    log_shift: float,
+    stop_transmittance: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    states, numbers = states.clone(memory_format=torch.contiguous_format), numbers.clone()
+    vertices, wanted = torch.zeros_like(is_known), torch.zeros_like(slots, dtype=torch.bool)
+    o, d, t0, t1, box = (x.contiguous().numpy() for x in (origins, directions, near, far, aabb))
+    zeros, size = np.zeros_like(t0), np.float32(step)
+    ranges, counts = np.empty((len(o), 3), o.dtype), np.empty(len(o), np.int64)
+    launch(ray_ranges, o, d, t0, t1, zeros, box, size, ranges, counts)
+    reach = skips.contiguous().numpy()
+    bounds = np.empty((1, 3, 2), np.int64)
+    launch(block_bounds, reach[None], bounds)
+    table, known, low_, sides_, slots_, bricks_, brick_low_, waves_ = (
+        x.contiguous().numpy() for x in (displacements, is_known, low, sides, slots, bricks, brick_low, waves)
+    )
+    launch(
+        _trace,
+        (o, d, t0, ranges, counts),
+        (occupancy.contiguous().numpy(), reach, bounds[0], box, size),
+        (table, known, low_, sides_),
+        (
+            slots_, bricks_.reshape(len(bricks) * VERTICES, bricks.shape[2]), brick_low_, np.float32(cells_per_unit),
+            waves_, np.float32(log_shift),
+        ),
+        (splits, np.float32(min_weight), np.float32(stop_transmittance)),
+        states.numpy(),
+        numbers.numpy(),
+        vertices.numpy(),
+        wanted.numpy(),
+        _scratch(num_threads(), max(SAMPLES_AT_ONCE, splits), bricks.shape[2]),
+        (0,) * bricks.shape[2],
+    )  # fmt: skip
+    return states, numbers, vertices.view(-1), wanted
+
+
+def _scratch(num_workers: int, size: int, num_contents: int) -> tuple[np.ndarray, ...]:
+    """Each worker's: ends of intervals; their numbers, rows and parts' rows; fractions; contents; displacement."""
+    return (
+        np.empty((num_workers, size, 2), np.float32),
+        np.empty((num_workers, 3, size), np.int64),
+        np.empty((num_workers, 2, size, 3), np.float32),
+        np.empty((num_workers, max(num_contents, 16)), np.float32),
+        np.empty((num_workers, 16), np.float32),
+    )
+
+
+# No fast-math: intervals and cells must round like those of the definition.
+@njit(parallel=True, cache=True, nogil=True, **BORROWS)
+def _trace(
+    rays: Any,
+    grid: Any,
+    lattice: Any,
+    contents: Any,
+    options: Any,
+    states: Any,
+    numbers: Any,
+    vertices: Any,
+    wanted: Any,
+    scratch: Any,
+    lanes: Any,
+) -> None:
+    num_workers = len(scratch[0])
+    origins, directions, near, ranges, counts = rays
+    occupancy, skips, bounds, aabb, step = grid
+    splits = options[0]
+    num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
+    for worker in prange(num_workers):
+        intervals = scratch[0][worker], scratch[1][worker, 0]
+        found, parts = (scratch[1][worker, 1], scratch[2][worker, 0]), (scratch[1][worker, 2], scratch[2][worker, 1])
+        values, moved = scratch[3][worker], scratch[4][worker]
+        for group in range(worker, num_groups, num_workers):
+            for r in range(group * RAYS_AT_ONCE, min((group + 1) * RAYS_AT_ONCE, len(near))):
+                if numbers[r] < 0:
+                    continue
+                j, count, course = course_of(
+                    origins[r], directions[r], near[r], np.float32(0), step, ranges[r], counts[r],
+                    occupancy, bounds, aabb,
+                )  # fmt: skip
+                j = max(j, numbers[r])
+                end = GOES_ON
+                while end == GOES_ON:
+                    j, size, end = _gather(
+                        j, count, course, occupancy, skips, lattice, contents, intervals, found, moved, wanted
+                    )
+                    stopped, why = _composite(
+                        size, intervals, found, parts, course, lattice, contents, options, states[r], values, moved,
+                        wanted, lanes,
+                    )  # fmt: skip
+                    if why != GOES_ON:
+                        j, end = stopped, why
+                if end == LACKS_VERTEX:
+                    _mark_ahead(j, count, course, occupancy, skips, lattice, splits, vertices)
+                numbers[r] = j if end > GOES_ON else end
+
+
+@njit(**BORROWS)
+def _gather(
+    j: int,
+    count: int,
+    course: Any,
+    occupancy: Any,
+    skips: Any,
+    lattice: Any,
+    contents: Any,
+    intervals: Any,
+    found: Any,
+    moved: Any,
+    wanted: Any,
+) -> Any:
+    """The next intervals of a ray, their contents on their way: its next one, how many, and why not more."""
+    spans, numbers = intervals
+    for i in range(SAMPLES_AT_ONCE):
+        j, start, end = next_kept(j, count, course, occupancy, skips)
+        if j >= count:
+            return j, i, DONE
+        why = _find(np.float32(0.5) * (start + end), course, lattice, contents, found, i, moved, wanted)
+        if why != GOES_ON:
+            return j, i, why
+        spans[i, 0], spans[i, 1], numbers[i] = start, end, j
+        j += 1
+    return j, SAMPLES_AT_ONCE, GOES_ON
+
+
+@njit(**BORROWS)
+def _composite(
+    size: int,
+    intervals: Any,
+    found: Any,
+    parts: Any,
+    course: Any,
+    lattice: Any,
+    contents: Any,
+    options: Any,
+    state: Any,
+    values: Any,
+    moved: Any,
+    wanted: Any,
+    lanes: Any,
+) -> Any:
+    """Composite gathered intervals behind a ray's state; where it goes no further, and why not."""
+    splits, min_weight, stop_transmittance = options
+    spans, numbers = intervals
+    for i in range(size):
+        start, end = spans[i]
+        opacity = _opacity(found, i, end - start, contents, values, lanes)
+        if splits == 1:
+            _add(state, opacity, np.float32(0.5) * (start + end), values, contents[4])
+        elif state[0] * opacity > min_weight:
+            length = (end - start) / np.float32(splits)
+            for k in range(splits):
+                why = _find(
+                    _part(start, k, length),
+                    course,
+                    lattice,
+                    contents,
+                    parts,
+                    k,
+                    moved,
+                    wanted,
+                )
+                if why != GOES_ON:
+                    return numbers[i], why
+            for k in range(splits):
+                opacity = _opacity(parts, k, length, contents, values, lanes)
+                _add(state, opacity, _part(start, k, length), values, contents[4])
+        if not state[0] > stop_transmittance:
+            return numbers[i], DONE
+    return 0, GOES_ON
+
+
+@njit(**BORROWS)
+def _part(start: Any, k: int, length: Any) -> Any:
+    """Where the middle of a part of an interval is."""
+    return start + (np.float32(k) + np.float32(0.5)) * length
+
+
+@njit(**BORROWS)
+def _find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: int, moved: Any, wanted: Any) -> Any:
+    """Find in which row the contents at a distance begin, and the fractions in its cell; or what is lacking."""
+    displacements, is_known, low, sides = lattice
+    slots, bricks, brick_low, cells_per_unit = contents[:4]
+    is_in, (px, py, pz), (x, y, z), (u, v, w) = _place(middle, course, is_known, low, sides)
+    if not is_in:
+        return ELSEWHERE
+    _, ly, lx = is_known.shape
+    a = np.int64(x + lx * (y + ly * z))
+    b, c = a + lx, a + lx * ly
+    d = c + lx
+    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, FOUR)
+    if math.isnan(moved[0]):
+        return LACKS_VERTEX
+    px = (px + moved[0] - brick_low[0]) * cells_per_unit
+    py = (py + moved[1] - brick_low[1]) * cells_per_unit
+    pz = (pz + moved[2] - brick_low[2]) * cells_per_unit
+    if not is_inside(px, py, pz, slots):
+        return ELSEWHERE
+    x, y, z = cell_of(px, py, pz, slots)
+    number = slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS]
+    if number < 0:
+        wanted[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS] = True
+        return LACKS_BRICK
+    row = first_row(x, y, z, number)
+    for corner in (row, row + SIDE, row + SIDE * SIDE, row + SIDE * SIDE + SIDE):
+        prefetch_row(bricks, corner)
+        prefetch_row(bricks, corner + 1)
+    rows, fractions = found
+    rows[i] = row
+    fractions[i, 0], fractions[i, 1], fractions[i, 2] = px - np.float32(x), py - np.float32(y), pz - np.float32(z)
+    return GOES_ON
+
+
+@njit(**BORROWS)
+def _place(middle: Any, course: Any, is_known: Any, low: Any, sides: Any) -> Any:
+    """Whether a distance lies in the lattice, its position, its cell there, and the fractions in the cell."""
+    (ox, oy, oz), (dx, dy, dz) = course[:2]
+    one, zero = np.float32(1), np.float32(0)
+    px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
+    u, v, w = (px - low[0]) / sides[0], (py - low[1]) / sides[1], (pz - low[2]) / sides[2]
+    is_in = zero <= u <= one and zero <= v <= one and zero <= w <= one
+    lz, ly, lx = is_known.shape
+    x, u = locate(u, lx - 1)
+    y, v = locate(v, ly - 1)
+    z, w = locate(w, lz - 1)
+    return is_in, (px, py, pz), (x, y, z), (u, v, w)
+
+
+@njit(**BORROWS)
+def _opacity(found: Any, i: int, length: Any, contents: Any, values: Any, lanes: Any) -> Any:
+    """Look up the contents at a place that was found, and what an interval of them absorbs."""
+    rows, fractions = found
+    bricks, waves, log_shift = contents[1], contents[4], contents[5]
+    weights = corner_weights(fractions[i, 0], fractions[i, 1], fractions[i, 2])
+    blend_rows(bricks, corner_rows(rows[i]), weights, values, 0, lanes)
+    raw, most = log_shift + _total(values, 0, waves), np.float32(MOST_LOG_DENSITY)
+    return -math.expm1(-math.exp(most if raw > most else raw) * length)
+
+
+@njit(**BORROWS)
+def _add(state: Any, opacity: Any, distance: Any, values: Any, waves: Any) -> None:
+    """Composite one interval behind a ray's state."""
+    num_terms = len(waves)
+    weight = state[0] * opacity
+    for k in range(3):
+        state[1 + k] += weight * (
+            np.float32(1) / (np.float32(1) + math.exp(-_total(values, (1 + k) * num_terms, waves)))
+        )
+    state[4] += weight * distance
+    state[0] *= np.float32(1) - opacity
+
+
+@njit(**BORROWS)
+def _mark_ahead(
+    j: int, count: int, course: Any, occupancy: Any, skips: Any, lattice: Any, splits: int, vertices: Any
+) -> None:
+    """Mark the unknown vertices around a waiting ray's interval and the next ones."""
+    _, is_known, low, sides = lattice
+    for _ in range(LOOK_AHEAD):
+        j, start, end = next_kept(j, count, course, occupancy, skips)
+        if j >= count:
+            return
+        length = (end - start) / np.float32(splits)
+        for k in range(splits + 1):  # the parts' middles, then that of the whole
+            middle = np.float32(0.5) * (start + end) if k == splits else _part(start, k, length)
+            is_in, _, (x, y, z), _ = _place(middle, course, is_known, low, sides)
+            if is_in:
+                _mark(vertices, is_known, x, y, z)
+        j += 1
+
+
+@njit(**BORROWS)
+def _mark(vertices: Any, is_known: Any, x: int, y: int, z: int) -> None:
+    """Mark those vertices of a cell that are not known; several threads may mark the same."""
+    for c in range(z, z + 2):
+        for b in range(y, y + 2):
+            for a in range(x, x + 2):
+                if not is_known[c, b, a]:
+                    vertices[c, b, a] = True
+
+
+@njit(fastmath=FAST | {"reassoc"}, **BORROWS)
+def _total(values: Any, first: int, waves: Any) -> Any:
+    """The sum of a series' terms times their waves."""
+    total = np.float32(0)
+    for k in range(len(waves)):
+        total += values[first + k] * waves[k]
+    return total

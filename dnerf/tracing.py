@@ -1,0 +1,118 @@
+"""Rays of one frame through what is kept of a field, instead of asking it sample by sample."""
+
+import torch
+from torch import Tensor
+
+from dnerf.deformations.frame_lattice import FrozenDeformation
+from dnerf.fields import DeformedField, RadianceField
+from dnerf.fields.baked import BakedField
+from dnerf.kernels import FrameTables, MarchGrid, trace
+from dnerf.kernels.backend import choose
+from dnerf.rays import Rays
+
+PIONEERS = 5  # one ray of so many is sent ahead, to find what most of its neighbours will want
+
+
+class FrameTracer:
+    """Pictures of one time of a field whose displacements are on a lattice and whose contents are in bricks.
+
+    What `Renderer` shows of it, up to rounding and to where exactly an opaque ray ends, with one kernel (`trace`)
+    instead of a chain of them. Where that wants vertices or bricks that do not exist yet, they are made.
+
+    Args:
+        deformation: on its lattice, which it fills.
+        canonical: in its bricks, which it makes.
+        grid: occupied cells at that time.
+        waves: (K,), see `RadianceField.series_at`.
+        log_shift: likewise.
+        stop_transmittance: a ray ends once so little light is left, and what is seen as little is not split.
+    """
+
+    def __init__(
+        self,
+        deformation: FrozenDeformation,
+        canonical: BakedField,
+        grid: MarchGrid,
+        *,
+        waves: Tensor,
+        log_shift: float,
+        stop_transmittance: float,
+    ) -> None:
+        self.deformation = deformation
+        self.canonical = canonical
+        self.grid = grid
+        self.waves = waves
+        self.log_shift = log_shift
+        self.stop_transmittance = stop_transmittance
+
+    @classmethod
+    def of(
+        cls, field: RadianceField, grid: MarchGrid | None, time: float, stop_transmittance: float
+    ) -> "FrameTracer | None":
+        """A tracer of a frame's field, see `RadianceField.at_time`; None where there is no lattice, brick or kernel.
+
+        Args:
+            field: at that time.
+            grid: occupied cells at that time, or None.
+            time: of the frame, in [0, 1].
+            stop_transmittance: see `FrameTracer`.
+        """
+        if grid is None or not isinstance(field, DeformedField):
+            return None
+        deformation, canonical = field.deformation, field.canonical
+        if not isinstance(deformation, FrozenDeformation) or not isinstance(canonical, BakedField):
+            return None
+        series = canonical.series_at(time)
+        if series is None or grid.aabb.dtype != torch.float32 or choose(grid.aabb) != "numba":
+            return None
+        return cls(
+            deformation, canonical, grid, waves=series[0], log_shift=series[1], stop_transmittance=stop_transmittance
+        )
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """What R rays show, without a background.
+
+        Args:
+            rays: all of the frame's time.
+
+        Returns:
+            rgb, depth times opacity, and opacity, (R, 5); and of which rays (R,) that is true. The others left the
+            lattices, or wanted bricks for which there is no room; theirs is 0.
+        """
+        states = rays.origins.new_zeros(len(rays), 5)
+        states[:, 0] = 1
+        fresh = torch.zeros(len(rays), dtype=torch.int64, device=states.device)
+        numbers = torch.full_like(fresh, -1)
+        numbers[::PIONEERS] = 0
+        while True:
+            states, numbers, vertices, bricks = trace(
+                rays.origins, rays.directions, rays.near, rays.far, states, numbers, self._tables(),
+                step=self.grid.step, splits=self.grid.splits, min_weight=self.stop_transmittance,
+                cells_per_unit=self.canonical.cells_per_unit, log_shift=self.log_shift,
+                stop_transmittance=self.stop_transmittance,
+            )  # fmt: skip
+            has_filled = self.deformation.fill(vertices.view_as(self.deformation.is_known))
+            has_made = self.canonical.make(bricks.nonzero())
+            if len(fresh):
+                numbers[torch.arange(len(rays), device=states.device) % PIONEERS > 0], fresh = 0, fresh[:0]
+            elif not has_filled and not has_made:
+                break
+        is_done = numbers == -1
+        sums = torch.cat([states[:, 1:], 1 - states[:, :1]], dim=-1)
+        return sums * is_done[:, None], is_done
+
+    def _tables(self) -> FrameTables:
+        return FrameTables(
+            occupancy=self.grid.occupancy,
+            skips=self.grid.skips,
+            aabb=self.grid.aabb,
+            displacements=self.deformation.displacements,
+            is_known=self.deformation.is_known,
+            low=self.deformation.low,
+            sides=self.deformation.sides,
+            slots=self.canonical.slots,
+            bricks=self.canonical.bricks,
+            brick_low=self.canonical.low,
+            waves=self.waves,
+        )

@@ -1,0 +1,117 @@
+"""Frames through lattices in one kernel show what the chain of samplers, fields and compositing shows."""
+
+import logging
+from unittest.mock import patch
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.cameras import Camera, Intrinsics, look_at
+from dnerf.deformations import DisplacementDeformation, FrameLattice
+from dnerf.fields import Baking, DeformedField, GridField, RadianceField
+from dnerf.kernels import use_backend
+from dnerf.renderer import Renderer
+from dnerf.samplers import OccupancySampler
+from dnerf.tracing import FrameTracer
+
+BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
+CAMERA = Camera(Intrinsics(32, 24, 30.0, 30.0), look_at([0.3, -3.2, 0.8], [0.0, 0.0, 0.0]))
+
+
+def model(
+    *, time_terms: int = 3, splits: int = 1, stop: float = 1e-4, box: list | None = None, max_bricks: int = 4096
+) -> Renderer:
+    """A random body in the middle of the box, moved a little, as frames of a sequence see it."""
+    torch.manual_seed(0)
+    canonical = GridField(BOX, (4, 9), 4, time_terms=time_terms, hidden_features=16, density_shift=2.0)
+    deformation = DisplacementDeformation(2, 16, (), position_frequencies=2, time_frequencies=2, canonical_time=None)
+    with torch.no_grad():
+        canonical.table.mul_(150)
+        for parameter in canonical.head.parameters():
+            parameter.add_(0.3 * torch.randn_like(parameter))
+        assert deformation.mlp.output is not None
+        deformation.mlp.output.weight.add_(0.03 * torch.randn_like(deformation.mlp.output.weight))
+    field = DeformedField(
+        deformation, canonical,
+        frame_lattice=FrameLattice(box or BOX, 24), baking=Baking(BOX, 32, max_bricks=max_bricks),
+    )  # fmt: skip
+    sampler = OccupancySampler(BOX, 0.03 * splits, 16, num_slabs=4, splits=splits, margin=0, pad_to=64)
+    mask = torch.zeros(16, 16, 16, dtype=torch.bool)
+    mask[5:11, 5:11, 4:12] = True
+    sampler.occupy(mask)
+    assert sampler.share < 0.1
+    return Renderer(field, sampler, stop_transmittance=stop).eval().for_sequence(60)
+
+
+def picture(renderer: Renderer, time: float = 0.3) -> Tensor:
+    shown = renderer.render_image(CAMERA, time)
+    return torch.cat([shown.rgb, shown.opacity[..., None], shown.depth[..., None]], dim=-1)
+
+
+@pytest.mark.parametrize("time_terms", [1, 3])
+@pytest.mark.parametrize("splits", [1, 3])
+def test_it_shows_what_the_chain_shows(time_terms: int, splits: int) -> None:
+    stop = 1e-5
+    with use_backend("reference"):
+        expected = picture(model(time_terms=time_terms, splits=splits, stop=stop))
+    with patch.object(FrameTracer, "__call__", autospec=True, side_effect=FrameTracer.__call__) as traced:
+        shown = picture(model(time_terms=time_terms, splits=splits, stop=stop))
+    assert traced.called
+    assert (expected[..., 3] > 0.9).any()
+    assert (expected[..., 3] == 0).any()
+    assert expected[..., :3].std() > 0.05
+    # Where opaque rays end and what is left out differ by the cut-off for each interval.
+    torch.testing.assert_close(shown, expected, rtol=0, atol=1e-3)
+
+
+def test_frames_do_not_depend_on_those_before() -> None:
+    renderer = model()
+    alone = picture(model(), 0.8)
+    picture(renderer, 0.1)
+    assert torch.equal(picture(renderer, 0.8), alone)
+    assert torch.equal(picture(renderer, 0.8), alone)
+
+
+def test_matter_outside_the_lattice_is_asked_for_itself() -> None:
+    small = [[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]
+    torch.testing.assert_close(picture(model(box=small)), picture(model()), rtol=0, atol=0.05)
+    with use_backend("reference"):
+        expected = picture(model(box=small))
+    torch.testing.assert_close(picture(model(box=small)), expected, rtol=0, atol=1e-3)
+
+
+def test_without_room_for_bricks_the_field_itself_is_asked(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        shown = picture(model(max_bricks=2))
+    assert "no room" in caplog.text
+    torch.testing.assert_close(shown, picture(model()), rtol=0, atol=0.05)
+
+
+def test_nan_is_shown_not_hidden() -> None:
+    renderer = model()
+    with torch.no_grad():
+        for parameter in renderer.field.deformation.parameters():  # type: ignore[union-attr]
+            parameter.fill_(torch.nan)
+    assert picture(renderer).isnan().any()
+
+
+def test_it_is_used_only_where_it_shows_the_same() -> None:
+    renderer = model()
+    grid, at = renderer.sampler.grid_at(0.3), renderer.field.at_time
+    assert FrameTracer.of(at(0.3), grid, 0.3, 1e-3) is not None
+    assert FrameTracer.of(at(0.3), None, 0.3, 1e-3) is None
+    assert FrameTracer.of(renderer.field, grid, 0.3, 1e-3) is None
+    with use_backend("reference"):
+        assert FrameTracer.of(at(0.3), grid, 0.3, 1e-3) is None
+
+    class Other(GridField):
+        def series_at(self, time: float) -> None:
+            return None
+
+    field: RadianceField = DeformedField(
+        renderer.field.deformation,
+        Baking(BOX, 8).bake(Other(BOX, (4,))),
+        frame_lattice=FrameLattice(BOX, 4),  # type: ignore[union-attr]
+    )
+    assert FrameTracer.of(field.at_time(0.3), grid, 0.3, 1e-3) is None
