@@ -106,7 +106,7 @@ def _grid(trained: OccupancySampler, *, resolution: int, num_slabs: int) -> Occu
 
 def _shortest(trained: OccupancySampler) -> float:
     """Length of the intervals at which the field is asked in the end."""
-    return trained.step_size / trained.splits
+    return trained.step_size / trained.render_splits
 
 
 def _everything(trained: OccupancySampler) -> OccupancySampler:
@@ -157,7 +157,7 @@ def _settings(
     for value in options["steps"][few]:
         yield Setting("step", value, changed(step_size=value))
     for value in options["splits"][few]:
-        yield Setting("splits", value, changed(step_size=value * _shortest(trained), splits=value), cut)
+        yield Setting("splits", value, changed(step_size=value * _shortest(trained), render_splits=value), cut)
     for value in options["cuts"][few]:
         yield Setting("cut-off", value, trained, value)
     for value in options["lattices"][few]:

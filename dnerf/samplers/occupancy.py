@@ -38,8 +38,10 @@ class OccupancySampler(Sampler):
     Args:
         box: (2, 3) corners of the space that is sampled, in world units.
         step_size: length of an interval, in world units.
-        splits: intervals in which something is seen (see `min_weight`) are cut into so many, at which the field is
-            asked, in training from when `step_size` is reached: empty and hidden ones are passed in long steps.
+        splits: in training, from `coarse_until` on, intervals in which something is seen (see `min_weight`)
+            are cut into so many, at which the field is asked: empty and hidden ones are passed in long steps.
+        render_splits: the same in evaluation mode; None for `splits`. A field that was learnt at intervals which begin
+            anywhere is known between their middles too, and pictures gain from shorter ones.
         coarse_step: length of an interval when training begins; it shrinks evenly (by equal factors in equal progress)
             to `step_size`. Long intervals clear haze early and see more rays for the same samples, short ones
             sharpen surfaces later. None for `step_size` from the start; evaluation always takes `step_size`.
@@ -86,6 +88,7 @@ class OccupancySampler(Sampler):
         render_margin: int = 1,
         narrow_from: float = 1.0,
         splits: int = 1,
+        render_splits: int | None = None,
         min_weight: float = 0.0,
         filter_joins: int = 1,
         pad_to: int = 2048,
@@ -101,6 +104,7 @@ class OccupancySampler(Sampler):
             ("update_every", update_every),
             ("num_probes", num_probes),
             ("splits", splits),
+            ("render_splits", splits if render_splits is None else render_splits),
             ("filter_joins", filter_joins),
             ("pad_to", pad_to),
         ):
@@ -122,7 +126,8 @@ class OccupancySampler(Sampler):
         self.coarse_until = coarse_until
         self.training_step = self.coarse_step
         self.splits = splits
-        self.training_splits = splits if self.coarse_step == step_size else 1
+        self.render_splits = splits if render_splits is None else render_splits
+        self.training_splits = 1
         self.narrow_from = narrow_from
         self.is_narrow = False
         self.threshold = threshold
@@ -163,7 +168,7 @@ class OccupancySampler(Sampler):
             jitter.uniform_(generator=generator)
         samples = self._march(rays, jitter)
         if not self.training:
-            return samples.split(self.splits)
+            return samples.split(self.render_splits)
         if self.min_weight > 0:
             samples = self._visible(samples, rays, field)
         return samples.split(self.training_splits).padded(self.pad_to)
@@ -177,12 +182,12 @@ class OccupancySampler(Sampler):
         self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
     ) -> Samples:
         """The intervals whose weight exceeds `min_weight`, split; all of them, as they are, if they are not split."""
-        if self.splits == 1:
+        if self.render_splits == 1:
             return samples
         positions, _, times = samples.locate(rays)
         optical_depth = field.density(positions, times) * samples.lengths
         weights = render_weights(optical_depth, samples) * samples.per_sample(transmittance)
-        return samples.kept(weights > min_weight).split(self.splits).padded(self.pad_to)
+        return samples.kept(weights > min_weight).split(self.render_splits).padded(self.pad_to)
 
     def _march(self, rays: Rays, jitter: Tensor, most: int | None = None) -> Samples:
         occupied, skips = self.occupied, self.skips
@@ -207,7 +212,7 @@ class OccupancySampler(Sampler):
 
     def set_progress(self, progress: float) -> None:
         """Shorten and split the intervals of training and drop its margin as it goes on, `progress` in [0, 1]."""
-        part = min(progress / self.coarse_until, 1.0) if self.coarse_step != self.step_size else 1.0
+        part = min(progress / self.coarse_until, 1.0)
         self.training_splits = self.splits if part == 1 else 1
         self.training_step = self.coarse_step * (self.step_size / self.coarse_step) ** part
         self.is_narrow = progress >= self.narrow_from
@@ -224,7 +229,7 @@ class OccupancySampler(Sampler):
             occupied, skips = self.rendered, self.rendered_skips
         slab = int(torch.tensor(time, dtype=self.box.dtype) * len(occupied))  # rounds as times of rays do
         slab = min(slab, len(occupied) - 1)
-        return MarchGrid(occupied[slab], skips[slab], self.box, self.step_size, self.splits)
+        return MarchGrid(occupied[slab], skips[slab], self.box, self.step_size, self.render_splits)
 
     @torch.no_grad()
     def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:

@@ -249,3 +249,18 @@ def test_contents_that_do_not_fit_are_refused(name: str) -> None:
         field.from_contents(torch.zeros(5, 7), torch.zeros(5))
     with pytest.raises(ValueError, match=r"times must have shape \(\) or \(5,\)"):
         field.from_contents(contents, torch.zeros(5, 1))
+
+
+@every_field
+def test_contents_add_up_as_the_field_says(name: str) -> None:
+    field = trained(name)
+    series = field.series_at(0.3)
+    if series is None:
+        assert not isinstance(field, GridField) or not field.num_contents
+        return
+    positions, directions, _ = some_points(4, 9)
+    waves, shift = series
+    terms = field.contents(positions).unflatten(-1, (4, len(waves))) @ waves
+    output = field(positions, directions, torch.full((4, 9), 0.3))
+    torch.testing.assert_close(output.density, torch.exp((terms[..., 0] + shift).clamp(max=15)), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(output.rgb, torch.sigmoid(terms[..., 1:]), rtol=1e-5, atol=1e-6)
