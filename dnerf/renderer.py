@@ -22,6 +22,7 @@ from dnerf.tracing import FrameTracer
 logger = logging.getLogger(__name__)
 
 PAD_TO = 2048  # samples; see `Samples.padded`
+MOST_AT_ONCE = 1 << 18  # samples of a picture's rays, before those that are seen are split: bounds the memory
 FRAMES_THAT_SHARE = 16  # from so many on a sequence has gained what keeping things between its frames costs
 MOST_TO_SHARE = 0.1  # of space, in which samples fall: haze is dearer to keep than to ask
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
@@ -38,8 +39,8 @@ class Renderer(nn.Module):
         precision: "float32", or "bfloat16" to run networks under autocast; positions, encodings and compositing stay
             float32 either way.
         stop_transmittance: whole images end a ray of packed samples once so little light is left, which changes
-            colours by at most as much (a sampler that refines leaves out what is seen as little); 0 to ask the field
-            everywhere. Without effect on other quadratures than the
+            colours by at most as much, and by as much again for each interval that a sampler which refines leaves out
+            since it is seen as little; 0 to ask the field everywhere. Without effect on other quadratures than the
             constant one, whose intervals do not depend on their neighbours.
 
     Raises:
@@ -112,6 +113,7 @@ class Renderer(nn.Module):
         numbers = torch.arange(len(rays), device=rays.near.device)
         sums = rays.origins.new_zeros(len(rays), 5)
         source = self._marched(rays) if self._ends_early else None
+        refines = source is not None
         if source is not None and tracer is not None:
             with self.autocast(rays.origins.device):
                 sums, is_done = tracer(rays)
@@ -129,14 +131,15 @@ class Renderer(nn.Module):
         def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
             chosen = rays[ray_numbers]
             with self.autocast(rays.origins.device):
-                part = self.sampler.refined(part, chosen, field, transmittance, self.stop_transmittance)
+                if refines:
+                    part = self.sampler.refined(part, chosen, field, transmittance, self.stop_transmittance)
                 output = field(*part.locate(chosen))
             seen = composite(part, output)
             columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
             sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))
             return 1 - seen.opacity
 
-        walk_front_to_back(source, numbers, self.stop_transmittance, visit)
+        walk_front_to_back(source, numbers, self.stop_transmittance, visit, most_at_once=MOST_AT_ONCE)
         rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
         rgb = rgb + (1 - opacity)[:, None] * self.background(rays.directions)
         return Rendering(rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity))
@@ -145,10 +148,10 @@ class Renderer(nn.Module):
     def _ends_early(self) -> bool:
         return self.stop_transmittance > 0 and self.quadrature == "constant"
 
-    def _tracer(self, field: RadianceField, time: float) -> FrameTracer | None:
+    def _tracer(self, field: RadianceField, camera: Camera, time: float) -> FrameTracer | None:
         if not self._ends_early:
             return None
-        return FrameTracer.of(field, self.sampler.grid_at(time), time, self.stop_transmittance)
+        return FrameTracer.of(field, self.sampler.grid_at(time, camera.pose.dtype), time, self.stop_transmittance)
 
     def _marched(self, rays: Rays) -> Source | None:
         """Samples that are looked for only when light still gets there; None if the sampler places all at once."""
@@ -226,7 +229,7 @@ class Renderer(nn.Module):
         try:
             seen = self.sampler.seen_pixels(camera, time)
             field = self.field.at_time(time)
-            parts = list(self._in_chunks(camera.rays(time, seen), field, chunk, self._tracer(field, time)))
+            parts = list(self._in_chunks(camera.rays(time, seen), field, chunk, self._tracer(field, camera, time)))
             columns = [torch.cat([p.rgb, p.opacity[:, None], p.depth[:, None]], dim=-1) for p in parts]
             if seen is None:
                 picture = torch.cat(columns)

@@ -8,16 +8,18 @@ from dnerf.fields import DeformedField, RadianceField
 from dnerf.fields.baked import BakedField
 from dnerf.kernels import FrameTables, MarchGrid, trace
 from dnerf.kernels.backend import choose
+from dnerf.kernels.trace import DONE, NUM_STATES
 from dnerf.rays import Rays
 
-PIONEERS = 5  # one ray of so many is sent ahead, to find what most of its neighbours will want
+PIONEERS = 5  # one ray of so many is sent ahead once, to find what most of its neighbours will want
 
 
 class FrameTracer:
     """Pictures of one time of a field whose displacements are on a lattice and whose contents are in bricks.
 
-    What `Renderer` shows of it, up to rounding and to where exactly an opaque ray ends, with one kernel (`trace`)
-    instead of a chain of them. Where that wants vertices or bricks that do not exist yet, they are made.
+    What `Renderer` shows of it, with one kernel (`trace`) instead of a chain of them; the two differ by rounding, and
+    by the light of the intervals that only one of them takes for unseen. Where the kernel wants vertices or bricks
+    that do not exist yet, they are made.
 
     Args:
         deformation: on its lattice, which it fills.
@@ -25,7 +27,8 @@ class FrameTracer:
         grid: occupied cells at that time.
         waves: (K,), see `RadianceField.series_at`.
         log_shift: likewise.
-        stop_transmittance: a ray ends once so little light is left, and what is seen as little is not split.
+        stop_transmittance: a ray ends once so little light is left, and if intervals are split, one that is seen as
+            little is left out.
     """
 
     def __init__(
@@ -80,11 +83,28 @@ class FrameTracer:
             rgb, depth times opacity, and opacity, (R, 5); and of which rays (R,) that is true. The others left the
             lattices, or wanted bricks for which there is no room; theirs is 0.
         """
-        states = rays.origins.new_zeros(len(rays), 5)
+        for part in (self.deformation, self.canonical):
+            part.move_to(rays.origins.device)
+        states = torch.zeros(len(rays), NUM_STATES, device=rays.origins.device)
         states[:, 0] = 1
-        fresh = torch.zeros(len(rays), dtype=torch.int64, device=states.device)
-        numbers = torch.full_like(fresh, -1)
+        numbers = torch.full((len(rays),), DONE, device=states.device)
         numbers[::PIONEERS] = 0
+        states, numbers, vertices = self._followed(rays, states, numbers)
+        self.deformation.fill(vertices)
+        numbers[torch.arange(len(rays), device=states.device) % PIONEERS > 0] = 0
+        while True:
+            states, numbers, vertices = self._followed(rays, states, numbers)
+            if not self.deformation.fill(vertices):
+                break
+        is_done = numbers == DONE
+        sums = torch.cat([states[:, 1:], 1 - states[:, :1]], dim=-1)
+        return torch.where(is_done[:, None], sums, 0).to(rays.origins.dtype), is_done
+
+    def _followed(self, rays: Rays, states: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """States and numbers of rays as far as the vertices that are known let them come, and those that are wanted.
+
+        Which vertices are asked for together depends on the frame alone, not on the bricks that frames before it left.
+        """
         while True:
             states, numbers, vertices, bricks = trace(
                 rays.origins, rays.directions, rays.near, rays.far, states, numbers, self._tables(),
@@ -92,15 +112,8 @@ class FrameTracer:
                 cells_per_unit=self.canonical.cells_per_unit, log_shift=self.log_shift,
                 stop_transmittance=self.stop_transmittance,
             )  # fmt: skip
-            has_filled = self.deformation.fill(vertices.view_as(self.deformation.is_known))
-            has_made = self.canonical.make(bricks.nonzero())
-            if len(fresh):
-                numbers[torch.arange(len(rays), device=states.device) % PIONEERS > 0], fresh = 0, fresh[:0]
-            elif not has_filled and not has_made:
-                break
-        is_done = numbers == -1
-        sums = torch.cat([states[:, 1:], 1 - states[:, :1]], dim=-1)
-        return sums * is_done[:, None], is_done
+            if not self.canonical.make(bricks.nonzero()):
+                return states, numbers, vertices.view_as(self.deformation.is_known)
 
     def _tables(self) -> FrameTables:
         return FrameTables(

@@ -74,7 +74,7 @@ class FrozenDeformation(Deformation):
         # Padded samples carry the time of a ray too, so all are one.
         if not bool((times - self.time).abs().amax() < 1e-6):
             raise ValueError(f"times must all be {self.time}, got values from {times.min()} to {times.max()}")
-        self._to(positions.device)
+        self.move_to(positions.device)
         points = positions.reshape(-1, 3)
         unit = (points - self.low.to(points.dtype)) / self.sides.to(points.dtype)
         self._fill(unit)
@@ -85,7 +85,8 @@ class FrozenDeformation(Deformation):
             moved[rest] = self.deformation(points[rest], times.reshape(-1)[rest]).to(moved.dtype)
         return moved.reshape(positions.shape)
 
-    def _to(self, device: torch.device) -> None:
+    def move_to(self, device: torch.device) -> None:
+        """Have what is kept on a device."""
         if self.displacements.device != device:
             self.low, self.sides = self.low.to(device), self.sides.to(device)
             self.displacements, self.is_known = self.displacements.to(device), self.is_known.to(device)

@@ -110,7 +110,7 @@ class BakedField(RadianceField):
     @torch.no_grad()
     def contents(self, positions: Tensor) -> Tensor:
         """Interpolated contents (..., C) at positions (..., 3), in their dtype."""
-        self._to(positions.device)
+        self.move_to(positions.device)
         points = positions.reshape(-1, 3)
         cells = ((points - self.low.to(points.dtype)) * self.cells_per_unit).to(self.bricks.dtype)
         values, is_known = self._values(cells)
@@ -128,7 +128,8 @@ class BakedField(RadianceField):
         missing = self._missing(cells[~found[1]])
         return brick_lookup(cells, self.slots, self.bricks) if self.make(missing) else found
 
-    def _to(self, device: torch.device) -> None:
+    def move_to(self, device: torch.device) -> None:
+        """Have what is kept on a device."""
         if self.slots.device != device:
             self.low, self.slots, self.bricks = (x.to(device) for x in (self.low, self.slots, self.bricks))
 

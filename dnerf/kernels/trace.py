@@ -14,6 +14,7 @@ from .grid_encode import GridLevels, grid_encode_reference
 from .march import kept_intervals
 from .skip_distances import blocks_shape
 
+# numba's cache on disk does not notice a change of these: touch the files that import them.
 DONE, ELSEWHERE = -1, -2
 LACKS_VERTEX, LACKS_BRICK = 1, 2
 LOOK_AHEAD = 8  # kept intervals of a waiting ray whose vertices are asked for at once
@@ -57,9 +58,11 @@ class FrameTables:
 
     def __post_init__(self) -> None:
         for name in ("occupancy", "is_known"):
-            value = getattr(self, name)
-            if value.ndim != 3 or value.dtype != torch.bool:
-                raise ValueError(f"{name} must be bool of three axes, got {value.dtype} {tuple(value.shape)}")
+            value, least = getattr(self, name), 1 + (name == "is_known")
+            if value.ndim != 3 or value.dtype != torch.bool or min(value.shape) < least:
+                raise ValueError(
+                    f"{name} must be bool of three axes of at least {least}, got {value.dtype} {tuple(value.shape)}"
+                )
         shapes = {
             "skips": blocks_shape(self.occupancy[None])[1:],
             "aabb": (2, 3),
@@ -68,12 +71,16 @@ class FrameTables:
             "sides": (3,),
             "bricks": (len(self.bricks), VERTICES, 4 * len(self.waves)),
             "brick_low": (3,),
+            "waves": (self.waves.numel(),),
         }
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}")
-        if self.slots.ndim != 3 or self.slots.dtype != torch.int64:
+        if self.slots.ndim != 3 or self.slots.dtype != torch.int64 or not self.slots.numel():
             raise ValueError(f"slots must be int64 of three axes, got {self.slots.dtype} {tuple(self.slots.shape)}")
+        for name in ("aabb", "displacements", "low", "sides", "bricks", "brick_low", "waves"):
+            if getattr(self, name).dtype != torch.float32:
+                raise ValueError(f"{name} must be float32, got {getattr(self, name).dtype}")
 
     def tensors(self) -> list[Tensor]:
         """All of them, in the order of the arguments."""
@@ -128,8 +135,8 @@ def trace(
 
     Returns:
         states (R, 5); numbers (R,) with -1 for a ray that has ended and -2 for one that left the lattices, at a place
-        that nothing here can know; which vertices (V,) are wanted: those of a waiting ray's interval and of the next
-        ones, displaced or not; and which bricks (Bx, By, Bz).
+        that nothing here can know; which vertices (V,) are wanted: where a ray waits for one, all around that interval
+        and the next ones that are not known; and which bricks (Bx, By, Bz) rays wait for.
 
     Raises:
         ValueError: shapes that do not fit each other.
@@ -141,6 +148,9 @@ def trace(
     for name, value in (given | {"states": states, "numbers": numbers}).items():
         if value.shape != shapes[name]:
             raise ValueError(f"{name} must have shape {shapes[name]}, got {tuple(value.shape)}")
+    for name, number in (("step", step), ("splits", splits)):
+        if not number > 0:
+            raise ValueError(f"{name} must be positive, got {number}")
     rays = [x.float() for x in (origins, directions, near, far, states)]
     scalars = (float(step), splits, float(min_weight), cells_per_unit, float(log_shift), float(stop_transmittance))
     arguments: tuple[Any, ...] = (*rays, numbers, *tables.tensors(), *scalars)
@@ -181,8 +191,8 @@ def trace_reference(
     levels = GridLevels([cells], 1 << (is_known.numel() - 1).bit_length())
     shape = torch.tensor(slots.shape, device=near.device)
 
-    def look(chosen: Tensor, middles: Tensor) -> tuple[Tensor, Tensor]:
-        """What chosen rays (n,) find at distances: contents (n, 4 K), and whether, or why not (n,)."""
+    def look(chosen: Tensor, middles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What chosen rays (n,) find at distances: contents (n, 4 K); whether, or why not (n,); and in which brick."""
         points = origins[chosen] + middles[:, None] * directions[chosen]
         unit = (points - low) / sides
         canonical = points + grid_encode_reference(unit, displacements, levels)[:, :3]
@@ -192,12 +202,11 @@ def trace_reference(
         why = torch.where(is_found, 0, torch.where(is_inside, LACKS_BRICK, ELSEWHERE))
         why[canonical.isnan().any(-1)] = LACKS_VERTEX
         why[~((unit >= 0) & (unit <= 1)).all(-1)] = ELSEWHERE
-        lacking = torch.minimum(places[why == LACKS_BRICK].long() // BRICK, shape - 1)
-        wanted[lacking.unbind(-1)] = True
-        return contents, why
+        return contents, why, torch.minimum(places.nan_to_num().long() // BRICK, shape - 1)
 
-    def stop(chosen: Tensor, why: Tensor) -> Tensor:
+    def stop(chosen: Tensor, why: Tensor, brick: Tensor) -> Tensor:
         """Let those rays wait or give up that lack something; which do not (n,)."""
+        wanted[brick[why == LACKS_BRICK].unbind(-1)] = True
         numbers[chosen[why == ELSEWHERE]] = ELSEWHERE
         waits[chosen[why == LACKS_VERTEX]] = True
         goes_on[chosen[why != 0]] = False
@@ -218,17 +227,18 @@ def trace_reference(
         goes_on = numbers == j
         chosen = goes_on.nonzero()[:, 0]
         first, lengths = starts[chosen, j], ends[chosen, j] - starts[chosen, j]
-        contents, why = look(chosen, 0.5 * (first + ends[chosen, j]))
-        able = stop(chosen, why)
+        contents, why, brick = look(chosen, 0.5 * (first + ends[chosen, j]))
+        able = stop(chosen, why, brick)
         chosen, contents, first, lengths = chosen[able], contents[able], first[able], lengths[able]
         if splits > 1:
-            able = states[chosen, 0] * opacities(contents, lengths) > min_weight
+            able = ~(states[chosen, 0] * opacities(contents, lengths) <= min_weight)  # NaN is seen
             chosen, first, lengths = chosen[able], first[able], lengths[able] / splits
             found = [look(chosen, first + (k + 0.5) * lengths) for k in range(splits)]
-            why = torch.stack([why for _, why in found])
-            why = why.gather(0, (why != 0).long().argmax(0)[None])[0]  # of the first part that lacks something
-            able = stop(chosen, why)
-            for k, (contents, _) in enumerate(found):
+            why = torch.stack([why for _, why, _ in found])
+            lacks = (why != 0).long().argmax(0)  # the first part that lacks something
+            rays = torch.arange(len(chosen), device=near.device)
+            able = stop(chosen, why[lacks, rays], torch.stack([brick for _, _, brick in found])[lacks, rays])
+            for k, (contents, _, _) in enumerate(found):
                 middles = first + (k + 0.5) * lengths
                 add(chosen[able], contents[able], middles[able], lengths[able])
         else:

@@ -69,10 +69,12 @@ class Sampler(nn.Module, ABC):
         """
         return None
 
-    def grid_at(self, time: float) -> MarchGrid | None:
-        """The cells of which evaluation mode keeps the intervals of `march`, at a time in [0, 1].
+    def grid_at(self, time: float, dtype: torch.dtype) -> MarchGrid | None:
+        """The cells of which evaluation mode keeps the intervals of `march`; None unless overridden.
 
-        None from a sampler that places samples otherwise (unless overridden).
+        Args:
+            time: of all rays, in [0, 1].
+            dtype: of the rays, in which a time may round to another slab.
         """
         return None
 

@@ -61,9 +61,10 @@ class OccupancySampler(Sampler):
         min_weight: in training, the field is first asked for densities without gradients, front to back, and only
             samples whose weight in the picture exceeds this get the pass with gradients; 0 for all. (Pictures leave out
             less than `Renderer.stop_transmittance` instead, and ask twice only to find what is to be split.)
-        filter_joins: the filter of `min_weight` asks once for so many neighbouring intervals, and keeps all or none.
-        pad_to: in training the number of samples is rounded up to a multiple of this, see `Samples.padded` (1 for no
-            padding).
+        filter_joins: until intervals are split, the filter of `min_weight` asks once for so many neighbouring ones, and
+            keeps all or none.
+        pad_to: in training, and where intervals are split, the number of samples is rounded up to a multiple of this,
+            see `Samples.padded` (1 for no padding).
 
     Raises:
         ValueError: for numbers out of range.
@@ -181,18 +182,17 @@ class OccupancySampler(Sampler):
     def refined(
         self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
     ) -> Samples:
-        """The intervals whose weight exceeds `min_weight`, split; all of them, as they are, if they are not split."""
+        """The intervals whose weight exceeds `min_weight`, split; all of them, as they are, if pictures split none."""
         if self.render_splits == 1:
             return samples
         positions, _, times = samples.locate(rays)
         optical_depth = field.density(positions, times) * samples.lengths
         weights = render_weights(optical_depth, samples) * samples.per_sample(transmittance)
-        return samples.kept(weights > min_weight).split(self.render_splits).padded(self.pad_to)
+        is_seen = ~(weights <= min_weight)  # NaN is
+        return samples.kept(is_seen).split(self.render_splits).padded(self.pad_to)
 
     def _march(self, rays: Rays, jitter: Tensor, most: int | None = None) -> Samples:
-        occupied, skips = self.occupied, self.skips
-        if (not self.training or self.is_narrow) and self.rendered is not None and self.rendered_skips is not None:
-            occupied, skips = self.rendered, self.rendered_skips
+        occupied, skips = self._looked_into(self.is_narrow or not self.training)
         marched = march(
             rays.origins,
             rays.directions,
@@ -210,6 +210,12 @@ class OccupancySampler(Sampler):
             marched.starts, marched.ends, len(rays), ray_indices=marched.ray_indices, ray_offsets=marched.offsets
         )
 
+    def _looked_into(self, is_narrow: bool) -> tuple[Tensor, Tensor]:
+        """Occupied cells, those of pictures or those of training, and their skips."""
+        if is_narrow and self.rendered is not None and self.rendered_skips is not None:
+            return self.rendered, self.rendered_skips
+        return self.occupied, self.skips
+
     def set_progress(self, progress: float) -> None:
         """Shorten and split the intervals of training and drop its margin as it goes on, `progress` in [0, 1]."""
         part = min(progress / self.coarse_until, 1.0)
@@ -222,12 +228,10 @@ class OccupancySampler(Sampler):
         """Share of the cells that pictures look into."""
         return float((self.occupied if self.rendered is None else self.rendered).float().mean())
 
-    def grid_at(self, time: float) -> MarchGrid:
+    def grid_at(self, time: float, dtype: torch.dtype) -> MarchGrid:
         """The slab that pictures of a time look into."""
-        occupied, skips = self.occupied, self.skips
-        if self.rendered is not None and self.rendered_skips is not None:
-            occupied, skips = self.rendered, self.rendered_skips
-        slab = int(torch.tensor(time, dtype=self.box.dtype) * len(occupied))  # rounds as times of rays do
+        occupied, skips = self._looked_into(is_narrow=True)
+        slab = int(torch.tensor(time, dtype=dtype) * len(occupied))  # rounds as times of rays do
         slab = min(slab, len(occupied) - 1)
         return MarchGrid(occupied[slab], skips[slab], self.box, self.step_size, self.render_splits)
 
@@ -238,7 +242,7 @@ class OccupancySampler(Sampler):
         So a frame costs what the body covers, not what the picture holds. No pixel is lost: cells are convex, so the
         rectangle around a cell's corners holds all of it.
         """
-        lowest = self.grid_at(time).occupancy.nonzero()
+        lowest = self.grid_at(time, camera.pose.dtype).occupancy.nonzero()
         unit = (lowest[:, None] + cube_corners(lowest.device)) / self.shape[1:]
         return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
 
@@ -254,7 +258,7 @@ class OccupancySampler(Sampler):
         return self._within(self._cells[chosen], torch.rand(count, 4, generator=generator, device=device))
 
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
-        asked, number = joined(samples, self.filter_joins)
+        asked, number = joined(samples, self.filter_joins if self.training_splits == 1 else 1)
         is_visible = visible_samples(
             asked, rays, field, self.min_weight,
             first_round=FIRST_ROUND, most_at_once=MOST_AT_ONCE, pad_to=self.pad_to, observe=self.observe,

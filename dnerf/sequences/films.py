@@ -94,14 +94,17 @@ def render_frames_to(
     # Most of the time that a file takes is waiting for the disk.
     with ThreadPoolExecutor(1) as writer:
         in_hand: tuple[int, Future[None]] | None = None
-        for index in missing:
-            following = views[index + 1] if index + 1 < len(views) else None
-            layers = render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk)
+        try:
+            for index in missing:
+                following = views[index + 1] if index + 1 < len(views) else None
+                layers = render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk)
+                previous, in_hand = in_hand, None
+                if previous is not None:
+                    finish(*previous)
+                in_hand = index, writer.submit(store.write, index, layers)
+        finally:
             if in_hand is not None:
                 finish(*in_hand)
-            in_hand = index, writer.submit(store.write, index, layers)
-        if in_hand is not None:
-            finish(*in_hand)
     return len(missing)
 
 

@@ -178,6 +178,22 @@ def test_rays_that_leave_the_lattices_say_so_and_nan_is_not_hidden(backend):
     assert (kept[1] == -2).all()
 
 
+@pytest.mark.parametrize("backend", ["reference", "numba"])
+def test_bricks_behind_opaque_matter_are_not_wanted(backend):
+    scene = tables(bricks=1.0, reach=0.0, share=1.0)
+    origins, directions = torch.tensor([[-3.0, 0.0, 0.7]]), torch.tensor([[1.0, 0.0, 0.0]])
+    bundle = origins, directions, torch.zeros(1), torch.full((1,), 9.0)
+    slots, bricks = scene.slots.clone(), torch.zeros_like(scene.bricks)
+    slots[1:] = -1  # all but the first that the ray meets
+    bricks[..., 0] = 40 * scene.waves[0].sign()
+    for opaque in (True, False):
+        part = FrameTables(**vars(scene) | {"slots": slots, "bricks": bricks if opaque else -bricks})
+        with kernels.use_backend(backend):
+            _, numbers, _, wanted = trace(*bundle, *fresh(1), part, **OPTIONS, stop_transmittance=1e-3)
+        assert wanted.sum() == (0 if opaque else 1)
+        assert (numbers == -1).item() is opaque
+
+
 def test_op_is_registered_properly():
     bundle, scene = rays(10), tables()
     torch.library.opcheck(
@@ -193,6 +209,9 @@ def test_op_is_registered_properly():
         ({"occupancy": torch.zeros(4, 4, 4)}, "occupancy must be bool of three axes"),
         ({"slots": torch.zeros(2, 2, 2)}, "slots must be int64"),
         ({"skips": torch.zeros(1, 1, 1)}, "skips must have shape"),
+        ({"is_known": torch.zeros(1, 4, 4, dtype=torch.bool)}, "is_known must be bool of three axes of at least 2"),
+        ({"slots": torch.zeros(0, 2, 2, dtype=torch.int64)}, "slots must be int64"),
+        ({"waves": torch.zeros(2, dtype=torch.float64)}, "waves must be float32"),
     ],
 )
 def test_wrong_tables_are_refused(wrong, message):
@@ -204,5 +223,10 @@ def test_wrong_rays_are_refused():
     origins, directions, near, far = rays(4)
     with pytest.raises(ValueError, match=r"near must have shape \(4,\)"):
         trace(origins, directions, near[:3], far, *fresh(4), tables(), **OPTIONS, stop_transmittance=0.0)
+    for name in ("step", "splits"):
+        with pytest.raises(ValueError, match=f"{name} must be positive"):
+            trace(
+                origins, directions, near, far, *fresh(4), tables(), **OPTIONS | {name: 0}, stop_transmittance=0.0
+            )  # fmt: skip
     with pytest.raises(ValueError, match=r"states must have shape \(4, 5\)"):
         trace(origins, directions, near, far, *fresh(3), tables(), **OPTIONS, stop_transmittance=0.0)

@@ -1,5 +1,8 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""numba version of `brick_lookup`."""
+"""numba version of `brick_lookup`.
+
+`trace` uses some of these functions; numba's cache on disk does not notice a change here: touch that file as well.
+"""
 
 from typing import Any
 

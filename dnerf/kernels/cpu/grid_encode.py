@@ -1,5 +1,8 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""numba versions of `grid_encode` and its gradients."""
+"""numba versions of `grid_encode` and its gradients.
+
+`trace` uses some of these functions; numba's cache on disk does not notice a change here: touch that file as well.
+"""
 
 from functools import lru_cache
 from typing import Any

@@ -21,8 +21,9 @@ if "NUMBA_THREADING_LAYER" not in os.environ and "NUMBA_THREADING_LAYER_PRIORITY
 FAST = {"contract", "nsz"}
 
 # numba counts references to arrays at every call between compiled functions, atomically, which can take longer than
-# the call. Functions that only look at arrays which somebody else holds, and make none, do without.
-BORROWS: dict[str, Any] = {"_nrt": False}
+# the call. Functions that only look at arrays which somebody else holds, and make or return none, do without. Divisions
+# by zero are infinite or NaN in them, as in the bodies of parallel loops.
+BORROWS: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
 
 
 def num_threads() -> int:

@@ -1,5 +1,8 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""numba version of `march`."""
+"""numba version of `march`.
+
+`trace` marches by the same functions; numba's cache on disk does not notice a change here: touch that file as well.
+"""
 
 import math
 from typing import Any
@@ -114,7 +117,7 @@ def block_bounds(skips: Any, bounds: Any) -> None:
                             bounds[k, axis, 1] = max(bounds[k, axis, 1], block + 1)
 
 
-@njit(error_model="numpy", **BORROWS)
+@njit(**BORROWS)
 def _clip(near: Any, far: Any, position: Any, speed: Any, margin: Any, bounds: Any, size: int) -> Any:
     """The part of [near, far] in which `position + speed t` may lie, on one axis, in the cells of the bounds."""
     dtype = type(position)
@@ -275,7 +278,7 @@ def _margin(rounding: Any, o: Any, d: Any, lower: Any, scale: Any, leave: Any, s
     return rounding * (type(o)(size) + scale * (abs(o) + abs(lower) + abs(d) * abs(leave)))
 
 
-@njit(error_model="numpy", **BORROWS)
+@njit(**BORROWS)
 def _free(position: Any, cell: int, radius: int, speed: Any, margin: Any) -> Any:
     """Distance along the ray that surely stays, on one axis, within the blocks closer than `radius`."""
     dtype = type(position)

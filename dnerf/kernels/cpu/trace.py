@@ -20,6 +20,7 @@ from .rows import blend_rows, prefetch_row
 RAYS_AT_ONCE = 64  # neighbours, dealt out to threads in turn: matter fills the middle of a picture
 SAMPLES_AT_ONCE = 8  # of a ray: while one is waiting for memory, the others are
 FOUR = (0, 0, 0, 0)
+LINE = 32  # float32s between what two workers write, so that they share no line of a cache
 GOES_ON = 0  # between what ends a ray and what it may lack
 
 
@@ -86,8 +87,8 @@ def _scratch(num_workers: int, size: int, num_contents: int) -> tuple[np.ndarray
         np.empty((num_workers, size, 2), np.float32),
         np.empty((num_workers, 3, size), np.int64),
         np.empty((num_workers, 2, size, 3), np.float32),
-        np.empty((num_workers, max(num_contents, 16)), np.float32),
-        np.empty((num_workers, 16), np.float32),
+        np.empty((num_workers, num_contents + LINE), np.float32),
+        np.empty((num_workers, len(FOUR) + LINE), np.float32),
     )
 
 
@@ -127,16 +128,19 @@ def _trace(
                 end = GOES_ON
                 while end == GOES_ON:
                     j, size, end = _gather(
-                        j, count, course, occupancy, skips, lattice, contents, intervals, found, moved, wanted
+                        j, count, course, occupancy, skips, lattice, contents, intervals, found, moved
                     )
                     stopped, why = _composite(
-                        size, intervals, found, parts, course, lattice, contents, options, states[r], values, moved,
-                        wanted, lanes,
+                        size, intervals, found, parts, course, lattice, contents, options, states[r], values,
+                        moved, lanes,
                     )  # fmt: skip
                     if why != GOES_ON:
                         j, end = stopped, why
                 if end == LACKS_VERTEX:
                     _mark_ahead(j, count, course, occupancy, skips, lattice, splits, vertices)
+                if end == LACKS_BRICK:
+                    _, first, last = next_kept(j, count, course, occupancy, skips)
+                    _mark_brick(first, last, splits, course, lattice, contents, moved, wanted)
                 numbers[r] = j if end > GOES_ON else end
 
 
@@ -152,7 +156,6 @@ def _gather(
     intervals: Any,
     found: Any,
     moved: Any,
-    wanted: Any,
 ) -> Any:
     """The next intervals of a ray, their contents on their way: its next one, how many, and why not more."""
     spans, numbers = intervals
@@ -160,7 +163,7 @@ def _gather(
         j, start, end = next_kept(j, count, course, occupancy, skips)
         if j >= count:
             return j, i, DONE
-        why = _find(np.float32(0.5) * (start + end), course, lattice, contents, found, i, moved, wanted)
+        why = _find(np.float32(0.5) * (start + end), course, lattice, contents, found, i, moved)
         if why != GOES_ON:
             return j, i, why
         spans[i, 0], spans[i, 1], numbers[i] = start, end, j
@@ -181,7 +184,6 @@ def _composite(
     state: Any,
     values: Any,
     moved: Any,
-    wanted: Any,
     lanes: Any,
 ) -> Any:
     """Composite gathered intervals behind a ray's state; where it goes no further, and why not."""
@@ -192,19 +194,10 @@ def _composite(
         opacity = _opacity(found, i, end - start, contents, values, lanes)
         if splits == 1:
             _add(state, opacity, np.float32(0.5) * (start + end), values, contents[4])
-        elif state[0] * opacity > min_weight:
+        elif not state[0] * opacity <= min_weight:  # NaN is seen
             length = (end - start) / np.float32(splits)
             for k in range(splits):
-                why = _find(
-                    _part(start, k, length),
-                    course,
-                    lattice,
-                    contents,
-                    parts,
-                    k,
-                    moved,
-                    wanted,
-                )
+                why = _find(_part(start, k, length), course, lattice, contents, parts, k, moved)
                 if why != GOES_ON:
                     return numbers[i], why
             for k in range(splits):
@@ -222,31 +215,13 @@ def _part(start: Any, k: int, length: Any) -> Any:
 
 
 @njit(**BORROWS)
-def _find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: int, moved: Any, wanted: Any) -> Any:
+def _find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: int, moved: Any) -> Any:
     """Find in which row the contents at a distance begin, and the fractions in its cell; or what is lacking."""
-    displacements, is_known, low, sides = lattice
-    slots, bricks, brick_low, cells_per_unit = contents[:4]
-    is_in, (px, py, pz), (x, y, z), (u, v, w) = _place(middle, course, is_known, low, sides)
-    if not is_in:
-        return ELSEWHERE
-    _, ly, lx = is_known.shape
-    a = np.int64(x + lx * (y + ly * z))
-    b, c = a + lx, a + lx * ly
-    d = c + lx
-    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, FOUR)
-    if math.isnan(moved[0]):
-        return LACKS_VERTEX
-    px = (px + moved[0] - brick_low[0]) * cells_per_unit
-    py = (py + moved[1] - brick_low[1]) * cells_per_unit
-    pz = (pz + moved[2] - brick_low[2]) * cells_per_unit
-    if not is_inside(px, py, pz, slots):
-        return ELSEWHERE
-    x, y, z = cell_of(px, py, pz, slots)
-    number = slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS]
-    if number < 0:
-        wanted[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS] = True
-        return LACKS_BRICK
-    row = first_row(x, y, z, number)
+    why, (x, y, z), (px, py, pz) = _brick(middle, course, lattice, contents, moved)
+    if why != GOES_ON:
+        return why
+    slots, bricks = contents[0], contents[1]
+    row = first_row(x, y, z, slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS])
     for corner in (row, row + SIDE, row + SIDE * SIDE, row + SIDE * SIDE + SIDE):
         prefetch_row(bricks, corner)
         prefetch_row(bricks, corner + 1)
@@ -254,6 +229,45 @@ def _find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: 
     rows[i] = row
     fractions[i, 0], fractions[i, 1], fractions[i, 2] = px - np.float32(x), py - np.float32(y), pz - np.float32(z)
     return GOES_ON
+
+
+@njit(**BORROWS)
+def _brick(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) -> Any:
+    """Whether a distance lies in a brick that exists, or why not; its cell; and the place, in cells."""
+    displacements, is_known, low, sides = lattice
+    slots, _, brick_low, cells_per_unit = contents[:4]
+    is_in, (px, py, pz), (x, y, z), (u, v, w) = _place(middle, course, is_known, low, sides)
+    if not is_in:
+        return ELSEWHERE, (x, y, z), (px, py, pz)
+    _, ly, lx = is_known.shape
+    a = np.int64(x + lx * (y + ly * z))
+    b, c = a + lx, a + lx * ly
+    d = c + lx
+    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, FOUR)
+    if math.isnan(moved[0]):
+        return LACKS_VERTEX, (x, y, z), (px, py, pz)
+    px = (px + moved[0] - brick_low[0]) * cells_per_unit
+    py = (py + moved[1] - brick_low[1]) * cells_per_unit
+    pz = (pz + moved[2] - brick_low[2]) * cells_per_unit
+    if not is_inside(px, py, pz, slots):
+        return ELSEWHERE, (x, y, z), (px, py, pz)
+    x, y, z = cell_of(px, py, pz, slots)
+    exists = slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS] >= 0
+    return GOES_ON if exists else LACKS_BRICK, (x, y, z), (px, py, pz)
+
+
+@njit(**BORROWS)
+def _mark_brick(
+    start: Any, end: Any, splits: int, course: Any, lattice: Any, contents: Any, moved: Any, wanted: Any
+) -> None:
+    """Mark the first brick that an interval lacks, in its middle or in those of its parts."""
+    length = (end - start) / np.float32(splits)
+    for k in range(-1, splits):
+        middle = np.float32(0.5) * (start + end) if k < 0 else _part(start, k, length)
+        why, (x, y, z), _ = _brick(middle, course, lattice, contents, moved)
+        if why == LACKS_BRICK:
+            wanted[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS] = True
+            return
 
 
 @njit(**BORROWS)
