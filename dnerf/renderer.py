@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from dnerf.backgrounds import Background, ConstantBackground
 from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
-from dnerf.compositing import Rendering, composite, safe_divide
+from dnerf.compositing import FieldOutput, Rendering, composite, safe_divide
 from dnerf.fields.base import RadianceField
 from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
@@ -22,7 +22,7 @@ from dnerf.tracing import FrameTracer
 logger = logging.getLogger(__name__)
 
 PAD_TO = 2048  # samples; see `Samples.padded`
-MOST_AT_ONCE = 1 << 18  # samples of a picture's rays, before those that are seen are split: bounds the memory
+MOST_AT_ONCE = 1 << 18  # samples of a picture that the field is asked in one go: bounds the memory, in haze
 FRAMES_THAT_SHARE = 16  # from so many on a sequence has gained what keeping things between its frames costs
 MOST_TO_SHARE = 0.1  # of space, in which samples fall: haze is dearer to keep than to ask
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
@@ -133,13 +133,13 @@ class Renderer(nn.Module):
             with self.autocast(rays.origins.device):
                 if refines:
                     part = self.sampler.refined(part, chosen, field, transmittance, self.stop_transmittance)
-                output = field(*part.locate(chosen))
+                output = _in_parts(field, *part.locate(chosen))
             seen = composite(part, output)
             columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
             sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))
             return 1 - seen.opacity
 
-        walk_front_to_back(source, numbers, self.stop_transmittance, visit, most_at_once=MOST_AT_ONCE)
+        walk_front_to_back(source, numbers, self.stop_transmittance, visit)
         rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
         rgb = rgb + (1 - opacity)[:, None] * self.background(rays.directions)
         return Rendering(rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity))
@@ -268,3 +268,13 @@ class Renderer(nn.Module):
                 continue
             start += chunk
             yield part
+
+
+def _in_parts(field: RadianceField, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+    """Density and colour of a field, asked so many samples at a time."""
+    if len(times) <= MOST_AT_ONCE:
+        return field(positions, directions, times)
+    parts = [
+        field(*part) for part in zip(*(x.split(MOST_AT_ONCE) for x in (positions, directions, times)), strict=True)
+    ]
+    return FieldOutput(torch.cat([part.density for part in parts]), torch.cat([part.rgb for part in parts]))

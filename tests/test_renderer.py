@@ -241,18 +241,19 @@ def test_renderer_without_rays_gives_no_pixels() -> None:
 
 
 class CountingFog(RadianceField):
-    """A ball of fog that remembers at how many points it was asked."""
+    """A ball of fog that remembers at how many points it was asked, in all and at once of late."""
 
     def __init__(self, density: float) -> None:
         super().__init__()
         self.strength = density
-        self.num_points = 0
+        self.num_points = self.most_at_once = 0
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         return self.strength * (positions.norm(dim=-1) < 0.9).to(positions.dtype)
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         self.num_points += len(times)
+        self.most_at_once = len(times)
         return FieldOutput(self.density(positions, times), torch.sigmoid(4 * positions))
 
 
@@ -300,6 +301,31 @@ def test_samplers_that_place_all_samples_at_once_end_early_too() -> None:
         for sampler in (OccupancySampler(BOX, 0.02), AllAtOnce(BOX, 0.02))
     ]
     torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb, rtol=0, atol=2e-6)
+
+
+def test_samplers_that_place_all_samples_at_once_split_them_once() -> None:
+    class AllAtOnce(OccupancySampler):
+        def first(self, rays: Rays, most: int) -> Samples | None:
+            return None
+
+    counts, pictures = [], []
+    for make, step, splits in ((OccupancySampler, 0.02, 1), (AllAtOnce, 0.06, 3)):
+        field = CountingFog(1.0)
+        sampler = make(BOX, step, splits=splits)
+        pictures.append(Renderer(field, sampler, stop_transmittance=1e-6).render_image(some_camera(21, 17), 0.5))
+        counts.append(field.num_points)
+    assert counts[1] == pytest.approx(counts[0], rel=0.2)
+    torch.testing.assert_close(pictures[0].opacity, pictures[1].opacity, rtol=0, atol=1e-5)
+
+
+def test_the_field_is_asked_in_parts_where_there_is_much_to_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, sampler = CountingFog(0.5), OccupancySampler(BOX, 0.06, splits=3)
+    pictures = []
+    for most in (1 << 18, 1000):
+        monkeypatch.setattr("dnerf.renderer.MOST_AT_ONCE", most)
+        pictures.append(Renderer(field, sampler, stop_transmittance=1e-6).render_image(some_camera(21, 17), 0.5))
+    assert torch.equal(pictures[0].rgb, pictures[1].rgb)
+    assert field.most_at_once <= 1000
 
 
 @pytest.mark.parametrize("stop", [-0.1, 1.0, math.nan])
