@@ -18,6 +18,7 @@ from dnerf.cameras import Intrinsics, fixed_path, look_at, orbit_path, spiral_pa
 from dnerf.checks import check_choice, check_positive
 from dnerf.data import DataSource, Frames, SyntheticData, render_exact
 from dnerf.renderer import Renderer
+from dnerf.samplers import OccupancySampler
 from dnerf.sequences import (
     FILM_FORMATS,
     FrameStore,
@@ -55,13 +56,14 @@ def main(config: DictConfig) -> None:
     share = Share(int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
     device = _own_device(config.device)
     renderer = load_renderer(config.run, saved, device)
+    _split(renderer, config.splits)
     data = build(saved.data)
     frames = data.frames(config.path.get("split", "test"))
     views = _views(config, frames, device)
     chunk = config.chunk or saved.chunk
     facts = {
         "model": _fingerprint(config.run), "outputs": outputs, "chunk": chunk, "device": device.type,
-        "exact": config.exact,
+        "exact": config.exact, "splits": config.splits,
     }  # fmt: skip
     path = _output(config, formats)
     store = FrameStore(path.parent / f".{path.name}.{sequence_digest(views, facts)}", len(views))
@@ -87,6 +89,17 @@ def main(config: DictConfig) -> None:
             print(f"{len(views)} frames: {written}")
         if not config.keep_frames:
             store.remove()
+
+
+def _split(renderer: Renderer, splits: object) -> None:
+    """Have pictures cut the steps in which something is seen into so many; None for as many as the run says."""
+    if splits is None:
+        return
+    if not isinstance(splits, int) or isinstance(splits, bool) or splits < 1:
+        raise ValueError(f"splits must be a whole number of at least 1, got {splits!r}")
+    if not isinstance(renderer.sampler, OccupancySampler):
+        raise ValueError(f"splits must be null for a run with a {type(renderer.sampler).__name__}, got {splits}")
+    renderer.sampler.render_splits = splits
 
 
 def _listed(value: str | ListConfig) -> list[str]:

@@ -187,6 +187,17 @@ def test_evaluation_by_protocol_says_everything_and_makes_tables(work):
     assert (work / "run" / "worst_frames_val.png").exists()
 
 
+def test_a_film_can_be_rendered_in_longer_steps(work):
+    films = []
+    for splits in (1, 4):
+        output = f"films/splits{splits}"
+        call("render", "run=run", "path=fixed", "num_frames=2", "format=npz", f"splits={splits}", f"output={output}")
+        films.append(np.load(work / f"{output}.npz")["rgb"].astype(float))
+    difference = np.abs(films[0] - films[1])
+    assert difference.max() > 0
+    assert difference.mean() < 10
+
+
 def test_a_protocol_sets_resolution_background_and_split(work, monkeypatch):
     monkeypatch.setitem(PROTOCOLS, "tiny", Protocol("tiny", 16, "black"))
     call("evaluate", "run=run", "protocol=tiny", "worst=0", "plots=false")
@@ -222,6 +233,8 @@ def test_report_is_made_from_what_lies_in_the_run(work):
 
 WRONG = [
     ("render", ("run=run", "exact=maybe"), "exact must be true or false, got 'maybe'"),
+    ("render", ("run=run", "splits=0"), "splits must be a whole number of at least 1, got 0"),
+    ("render", ("run=run", "splits=1.5"), "splits must be a whole number of at least 1, got 1.5"),
     ("render", ("run=run", "outputs=[sound]"), "outputs"),
     ("render", ("run=run", "outputs=[]"), "outputs"),
     ("render", ("run=run", "outputs=[compare]"), "compare"),
