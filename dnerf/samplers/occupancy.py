@@ -3,27 +3,24 @@
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dnerf.cameras import Camera
-from dnerf.checks import as_box, check_positive
+from dnerf.checks import check_positive
 from dnerf.compositing import render_weights
 from dnerf.fields.base import RadianceField
 from dnerf.geometry import cube_corners
-from dnerf.kernels import MarchGrid, march, skip_distances
+from dnerf.kernels import MarchGrid, march
 from dnerf.rays import Rays, Samples
-from dnerf.samplers.base import Sampler
-from dnerf.samplers.masks import slab_halves, widened
+from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.samplers.visibility import joined, visible_samples
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
 MOST_AT_ONCE = 1 << 17  # samples that the filter asks, where many rays meet haze: about 100 MiB in the networks' layers
-SPACE = (1, 2, 3)  # axes
-NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no picture shows
 
 
-class OccupancySampler(Sampler):
+class OccupancySampler(OccupancyGrid):
     """Equal steps through the occupied cells of a grid over space and time slabs.
 
     Every cell of every slab keeps a decaying maximum of the densities seen in it: those of the training samples
@@ -70,8 +67,6 @@ class OccupancySampler(Sampler):
         ValueError: for numbers out of range.
     """
 
-    observed = ("maxima",)
-
     def __init__(
         self,
         box: Sequence[Sequence[float]],
@@ -94,16 +89,14 @@ class OccupancySampler(Sampler):
         filter_joins: int = 1,
         pad_to: int = 2048,
     ) -> None:
-        super().__init__()
+        super().__init__(
+            box, resolution, num_slabs=num_slabs, threshold=threshold, decay=decay, update_every=update_every,
+            num_probes=num_probes, margin=margin, render_margin=render_margin,
+        )  # fmt: skip
         for name, value in (
             ("step_size", step_size),
             ("coarse_step", step_size if coarse_step is None else coarse_step),
             ("coarse_until", coarse_until),
-            ("resolution", resolution),
-            ("num_slabs", num_slabs),
-            ("threshold", threshold),
-            ("update_every", update_every),
-            ("num_probes", num_probes),
             ("splits", splits),
             ("render_splits", splits if render_splits is None else render_splits),
             ("filter_joins", filter_joins),
@@ -114,14 +107,6 @@ class OccupancySampler(Sampler):
             raise ValueError(f"coarse_until must be in (0, 1], got {coarse_until}")
         if not 0 <= narrow_from <= 1:
             raise ValueError(f"narrow_from must be in [0, 1], got {narrow_from}")
-        if not 0 < decay < 1:
-            raise ValueError(f"decay must be in (0, 1), got {decay}")
-        for name, value in (("margin", margin), ("render_margin", render_margin)):
-            if value not in (0, 1):
-                raise ValueError(f"{name} must be 0 or 1, got {value}")
-        corners = as_box(box)
-        sides = corners[1] - corners[0]
-        cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
         self.step_size = step_size
         self.coarse_step = step_size if coarse_step is None else coarse_step
         self.coarse_until = coarse_until
@@ -131,36 +116,9 @@ class OccupancySampler(Sampler):
         self.training_splits = 1
         self.narrow_from = narrow_from
         self.is_narrow = False
-        self.threshold = threshold
-        self.decay = decay
-        self.update_every = update_every
-        self.num_probes = num_probes
-        self.margin = margin
-        self.render_margin = render_margin
         self.min_weight = min_weight
         self.filter_joins = filter_joins
         self.pad_to = pad_to
-        self.register_buffer("box", corners, persistent=False)
-        self.register_buffer("shape", torch.tensor([num_slabs, *cells]), persistent=False)
-        self.register_buffer("strides", torch.tensor(torch.empty(num_slabs, *cells).stride()), persistent=False)
-        self.register_buffer("maxima", torch.full((num_slabs, *cells), NEGLIGIBLE * 1e-3))
-        self.register_buffer("occupied", torch.ones((num_slabs, *cells), dtype=torch.bool))
-        self.register_buffer("skips", skip_distances(self.occupied), persistent=False)
-        has_own = render_margin != margin
-        # Two for each slab: the earlier half is widened by the slab before, the later one by the slab after.
-        halves = torch.ones((2 * num_slabs, *cells), dtype=torch.bool) if has_own else None
-        self.register_buffer("rendered", halves)
-        self.register_buffer("rendered_skips", None if halves is None else skip_distances(halves), persistent=False)
-        self.register_load_state_dict_post_hook(_derive)
-        self.box: Tensor
-        self.shape: Tensor
-        self.strides: Tensor
-        self.skips: Tensor
-        self.maxima: Tensor
-        self.occupied: Tensor
-        self.rendered: Tensor | None
-        self.rendered_skips: Tensor | None
-        self._cells: Tensor | None = None  # numbers of the occupied ones, once asked for
 
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Packed samples; intervals begin at random offsets in training, at multiples of the step in evaluation."""
@@ -192,7 +150,7 @@ class OccupancySampler(Sampler):
         return samples.kept(is_seen).split(self.render_splits).padded(self.pad_to)
 
     def _march(self, rays: Rays, jitter: Tensor, most: int | None = None) -> Samples:
-        occupied, skips = self._looked_into(self.is_narrow or not self.training)
+        occupied, skips = self.looked_into(self.is_narrow or not self.training)
         marched = march(
             rays.origins,
             rays.directions,
@@ -210,12 +168,6 @@ class OccupancySampler(Sampler):
             marched.starts, marched.ends, len(rays), ray_indices=marched.ray_indices, ray_offsets=marched.offsets
         )
 
-    def _looked_into(self, is_narrow: bool) -> tuple[Tensor, Tensor]:
-        """Occupied cells, those of pictures or those of training, and their skips."""
-        if is_narrow and self.rendered is not None and self.rendered_skips is not None:
-            return self.rendered, self.rendered_skips
-        return self.occupied, self.skips
-
     def set_progress(self, progress: float) -> None:
         """Shorten and split the intervals of training and drop its margin as it goes on, `progress` in [0, 1]."""
         part = min(progress / self.coarse_until, 1.0)
@@ -223,14 +175,9 @@ class OccupancySampler(Sampler):
         self.training_step = self.coarse_step * (self.step_size / self.coarse_step) ** part
         self.is_narrow = progress >= self.narrow_from
 
-    @property
-    def share(self) -> float:
-        """Share of the cells that pictures look into."""
-        return float((self.occupied if self.rendered is None else self.rendered).float().mean())
-
     def grid_at(self, time: float, dtype: torch.dtype) -> MarchGrid:
         """The slab that pictures of a time look into."""
-        occupied, skips = self._looked_into(is_narrow=True)
+        occupied, skips = self.looked_into(is_narrow=True)
         slab = int(torch.tensor(time, dtype=dtype) * len(occupied))  # rounds as times of rays do
         slab = min(slab, len(occupied) - 1)
         return MarchGrid(occupied[slab], skips[slab], self.box, self.step_size, self.render_splits)
@@ -246,17 +193,6 @@ class OccupancySampler(Sampler):
         unit = (lowest[:, None] + cube_corners(lowest.device)) / self.shape[1:]
         return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
 
-    @torch.no_grad()
-    def places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
-        """Random positions and times in occupied cells, or None if no cell is occupied."""
-        if self._cells is None or self._cells.device != self.occupied.device:
-            self._cells = self.occupied.view(-1).nonzero()[:, 0]
-        if not len(self._cells):
-            return None
-        device = self._cells.device
-        chosen = torch.randint(len(self._cells), (count,), generator=generator, device=device)
-        return self._within(self._cells[chosen], torch.rand(count, 4, generator=generator, device=device))
-
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
         asked, number = joined(samples, self.filter_joins if self.training_splits == 1 else 1)
         is_visible = visible_samples(
@@ -264,93 +200,3 @@ class OccupancySampler(Sampler):
             first_round=FIRST_ROUND, most_at_once=MOST_AT_ONCE, pad_to=self.pad_to, observe=self.observe,
         )  # fmt: skip
         return samples.kept(is_visible[number])
-
-    @torch.no_grad()
-    def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:
-        """Enter the densities of training samples, all (N, ...), into the grid."""
-        unit = (positions - self.box[0]) / (self.box[1] - self.box[0])
-        cells = torch.cat([times[:, None], unit], dim=-1) * self.shape
-        cells = torch.minimum(cells.long().clamp_(min=0), self.shape - 1)
-        flat = (cells * self.strides).sum(-1)
-        self.maxima.view(-1).scatter_reduce_(0, flat, density.to(self.maxima.dtype), "amax")
-
-    @torch.no_grad()
-    def update(self, field: RadianceField, step: int) -> None:
-        """Probe random cells every `update_every` steps and decide anew which are occupied."""
-        if step == 0 or step % self.update_every:
-            return
-        device = self.maxima.device
-        generator = torch.Generator(device).manual_seed(step)
-        cells = torch.randint(self.maxima.numel(), (self.num_probes,), generator=generator, device=device)
-        within = torch.rand(self.num_probes, 4, generator=generator, device=device)
-        self.maxima.mul_(self.decay).clamp_(min=NEGLIGIBLE * 1e-3)
-        self._probe(field, cells, within)
-        self.decide()
-
-    @torch.no_grad()
-    def fill(self, field: RadianceField, probes_per_cell: int = 8, *, chunk: int = 1 << 18) -> None:
-        """Learn a finished field: forget everything, probe every cell at random points, decide what is occupied.
-
-        The picture then differs from the one without occupancy by what lies in cells whose probes (and neighbours')
-        are all below the threshold: at most `1 - exp(-threshold * length)` where the field is that thin.
-
-        Args:
-            field: trained or analytic.
-            probes_per_cell: random points of each cell and slab.
-            chunk: probes at a time.
-        """
-        self.maxima.fill_(NEGLIGIBLE * 1e-3)
-        device = self.maxima.device
-        generator = torch.Generator(device).manual_seed(0)
-        for _ in range(probes_per_cell):
-            for cells in torch.arange(self.maxima.numel(), device=device).split(chunk):
-                self._probe(field, cells, torch.rand(len(cells), 4, generator=generator, device=device))
-        self.decide(is_filled=True)
-
-    def decide(self, *, is_filled: bool = False) -> None:
-        """Decide from the maxima which cells are occupied; `fill` and `update` do so themselves.
-
-        Args:
-            is_filled: whether the maxima are those of a finished field, see `fill`.
-        """
-        threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
-        dense = self.maxima > threshold
-        occupied = widened(widened(dense, [0]), SPACE if self.margin else [])
-        if is_filled or self.rendered is None:
-            self._set(occupied, occupied.repeat_interleave(2, dim=0))
-        else:
-            self._set(occupied, widened(slab_halves(dense), SPACE if self.render_margin else []))
-
-    def _probe(self, field: RadianceField, cells: Tensor, within: Tensor) -> None:
-        density = field.density(*self._within(cells, within))
-        self.maxima.view(-1).scatter_reduce_(0, cells, density.to(self.maxima.dtype), "amax")
-
-    def _within(self, cells: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions (N, 3) and times (N,) at places (N, 4) in [0, 1] within cells (N,)."""
-        unit = (torch.stack(torch.unravel_index(cells, self.maxima.shape), dim=-1) + within) / self.shape
-        return torch.lerp(self.box[0], self.box[1], unit[:, 1:]), unit[:, 0]
-
-    @torch.no_grad()
-    def occupy(self, mask: Tensor) -> None:
-        """Say which cells are occupied, in training and in evaluation.
-
-        Args:
-            mask: (K, Gx, Gy, Gz) bool, or what broadcasts to it.
-        """
-        mask = mask.expand(self.occupied.shape)
-        self._set(mask, mask.repeat_interleave(2, dim=0))
-
-    def _set(self, occupied: Tensor, rendered: Tensor) -> None:
-        self.occupied.copy_(occupied)
-        if self.rendered is not None:
-            self.rendered.copy_(rendered)
-        _derive(self)
-
-
-def _derive(sampler: nn.Module, incompatible_keys: object = None) -> None:
-    """Derive what is not saved from the occupied cells: a sampler's skips; their list on demand."""
-    assert isinstance(sampler, OccupancySampler)
-    sampler._cells = None
-    sampler.skips.copy_(skip_distances(sampler.occupied))
-    if sampler.rendered is not None and sampler.rendered_skips is not None:
-        sampler.rendered_skips.copy_(skip_distances(sampler.rendered))
