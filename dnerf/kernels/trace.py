@@ -1,7 +1,6 @@
 """Rendering rays of one time through lattices: march, displace, look up and composite, ray by ray."""
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -86,11 +85,6 @@ class FrameTables:
         """All of them, in the order of the arguments."""
         return [getattr(self, field.name) for field in fields(self)]
 
-    @property
-    def cells(self) -> list[int]:
-        """Cells (Lx, Ly, Lz) of the lattice of displacements."""
-        return [size - 1 for size in reversed(self.is_known.shape)]
-
 
 @torch.no_grad()
 def trace(
@@ -152,37 +146,26 @@ def trace(
         if not number > 0:
             raise ValueError(f"{name} must be positive, got {number}")
     rays = [x.float() for x in (origins, directions, near, far, states)]
-    scalars = (float(step), splits, float(min_weight), cells_per_unit, float(log_shift), float(stop_transmittance))
-    arguments: tuple[Any, ...] = (*rays, numbers, *tables.tensors(), *scalars)
+    scalars = [float(x) for x in (step, min_weight, cells_per_unit, log_shift, stop_transmittance)]
+    arguments = (numbers, rays, tables.tensors(), splits, scalars)
     return torch.ops.dnerf.trace(*arguments) if choose(rays[0]) == "numba" else trace_reference(*arguments)
 
 
 def trace_reference(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    states: Tensor,
-    numbers: Tensor,
-    occupancy: Tensor,
-    skips: Tensor,
-    aabb: Tensor,
-    displacements: Tensor,
-    is_known: Tensor,
-    low: Tensor,
-    sides: Tensor,
-    slots: Tensor,
-    bricks: Tensor,
-    brick_low: Tensor,
-    waves: Tensor,
-    step: float,
-    splits: int,
-    min_weight: float,
-    cells_per_unit: float,
-    log_shift: float,
-    stop_transmittance: float,
+    numbers: Tensor, rays: list[Tensor], tables: list[Tensor], splits: int, scalars: list[float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The definition of `trace` in plain torch: all rays, one interval after the other."""
+    """The definition of `trace` in plain torch: all rays, one interval after the other.
+
+    Args:
+        numbers: see `trace`.
+        rays: origins, directions, near, far, states.
+        tables: those of `FrameTables`, in their order.
+        splits: see `trace`.
+        scalars: step, min_weight, cells_per_unit, log_shift, stop_transmittance.
+    """
+    origins, directions, near, far, states = rays
+    occupancy, _, aabb, displacements, is_known, low, sides, slots, bricks, brick_low, waves = tables
+    step, min_weight, cells_per_unit, log_shift, stop_transmittance = scalars
     still = torch.zeros_like(near)
     starts, ends, keep = kept_intervals(origins, directions, near, far, still, still, occupancy[None], aabb, step)
     states, numbers = states.clone(), numbers.clone()
@@ -236,8 +219,8 @@ def trace_reference(
             found = [look(chosen, first + (k + 0.5) * lengths) for k in range(splits)]
             why = torch.stack([why for _, why, _ in found])
             lacks = (why != 0).long().argmax(0)  # the first part that lacks something
-            rays = torch.arange(len(chosen), device=near.device)
-            able = stop(chosen, why[lacks, rays], torch.stack([brick for _, _, brick in found])[lacks, rays])
+            each = torch.arange(len(chosen), device=near.device)
+            able = stop(chosen, why[lacks, each], torch.stack([brick for _, _, brick in found])[lacks, each])
             for k, (contents, _, _) in enumerate(found):
                 middles = first + (k + 0.5) * lengths
                 add(chosen[able], contents[able], middles[able], lengths[able])
@@ -247,11 +230,11 @@ def trace_reference(
     numbers[(numbers >= 0) & (numbers >= keep.shape[1])] = DONE
 
     ahead = keep & waits[:, None] & (torch.arange(keep.shape[1], device=near.device) >= numbers[:, None])
-    rays, columns = (ahead & (ahead.cumsum(-1) <= LOOK_AHEAD)).nonzero().unbind(-1)
-    first, last = starts[rays, columns, None], ends[rays, columns, None]
+    owners, columns = (ahead & (ahead.cumsum(-1) <= LOOK_AHEAD)).nonzero().unbind(-1)
+    first, last = starts[owners, columns, None], ends[owners, columns, None]
     parts = torch.arange(splits, device=near.device) + 0.5
     middles = torch.cat([first + parts * ((last - first) / splits), 0.5 * (first + last)], dim=-1)
-    points = origins[rays, None] + middles[..., None] * directions[rays, None]
+    points = origins[owners, None] + middles[..., None] * directions[owners, None]
     unit = ((points - low) / sides).reshape(-1, 3)
     unit = unit[((unit >= 0) & (unit <= 1)).all(-1)]
     size = torch.tensor(cells, device=near.device)
@@ -263,65 +246,18 @@ def trace_reference(
 
 @torch.library.custom_op("dnerf::trace", mutates_args=())
 def _trace(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    states: Tensor,
-    numbers: Tensor,
-    occupancy: Tensor,
-    skips: Tensor,
-    aabb: Tensor,
-    displacements: Tensor,
-    is_known: Tensor,
-    low: Tensor,
-    sides: Tensor,
-    slots: Tensor,
-    bricks: Tensor,
-    brick_low: Tensor,
-    waves: Tensor,
-    step: float,
-    splits: int,
-    min_weight: float,
-    cells_per_unit: float,
-    log_shift: float,
-    stop_transmittance: float,
+    numbers: Tensor, rays: list[Tensor], tables: list[Tensor], splits: int, scalars: list[float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return run_compiled(
-        "trace", "trace", origins, directions, near, far, states, numbers, occupancy, skips, aabb, displacements,
-        is_known, low, sides, slots, bricks, brick_low, waves, step, splits, min_weight, cells_per_unit, log_shift,
-        stop_transmittance,
-    )  # fmt: skip
+    return run_compiled("trace", "trace", numbers, rays, tables, splits, scalars)
 
 
 @_trace.register_fake
 def _(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    states: Tensor,
-    numbers: Tensor,
-    occupancy: Tensor,
-    skips: Tensor,
-    aabb: Tensor,
-    displacements: Tensor,
-    is_known: Tensor,
-    low: Tensor,
-    sides: Tensor,
-    slots: Tensor,
-    bricks: Tensor,
-    brick_low: Tensor,
-    waves: Tensor,
-    step: float,
-    splits: int,
-    min_weight: float,
-    cells_per_unit: float,
-    log_shift: float,
-    stop_transmittance: float,
+    numbers: Tensor, rays: list[Tensor], tables: list[Tensor], splits: int, scalars: list[float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    is_known, slots = tables[4], tables[7]
     return (
-        torch.empty_like(states),
+        torch.empty_like(rays[4]),
         torch.empty_like(numbers),
         is_known.new_empty(is_known.numel()),
         torch.empty_like(slots, dtype=torch.bool),

@@ -67,7 +67,8 @@ def chain(bundle, scene, *, step, cells_per_unit, log_shift, splits=1, min_weigh
     samples = march(
         *bundle, times=zeros, jitter=zeros, occupancy=scene.occupancy[None], aabb=scene.aabb, step=step
     )  # fmt: skip
-    levels = GridLevels([scene.cells], 1 << (scene.is_known.numel() - 1).bit_length())
+    cells = [size - 1 for size in reversed(scene.is_known.shape)]
+    levels = GridLevels([cells], 1 << (scene.is_known.numel() - 1).bit_length())
 
     def look(numbers, distances):
         points = origins[numbers] + distances[:, None] * directions[numbers]
@@ -196,9 +197,9 @@ def test_bricks_behind_opaque_matter_are_not_wanted(backend):
 
 def test_op_is_registered_properly():
     bundle, scene = rays(10), tables()
-    torch.library.opcheck(
-        torch.ops.dnerf.trace, (*bundle, *fresh(10), *scene.tensors(), 0.05, 2, 1e-3, PER_UNIT, 1.0, 1e-3)
-    )
+    states, numbers = fresh(10)
+    scalars = [0.05, 1e-3, PER_UNIT, 1.0, 1e-3]
+    torch.library.opcheck(torch.ops.dnerf.trace, (numbers, [*bundle, states], scene.tensors(), 2, scalars))
 
 
 @pytest.mark.parametrize(

@@ -241,3 +241,36 @@ def test_films_have_the_frames(tmp_path: Path) -> None:
     shape = iio.imread(path).shape
     assert shape[:2] == (4, 16)
     assert shape[2] > 20  # the scale stands beside the picture
+
+
+def test_a_frame_that_cannot_be_written_ends_the_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write, told = FrameStore.write, []
+
+    def failing(self: FrameStore, index: int, layers: dict) -> None:
+        if index == 1:
+            raise OSError("no space left")
+        write(self, index, layers)
+
+    monkeypatch.setattr(FrameStore, "write", failing)
+    store = FrameStore(tmp_path, 4)
+    with pytest.raises(OSError, match="no space left"):
+        render_frames_to(store, make_renderer(), some_views(4), ["rgb"], on_frame=told.append)
+    assert told == [0]
+    assert store.missing() == [1, 2, 3]
+
+
+def test_a_rendering_that_fails_keeps_the_frame_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    render, told = Renderer.render_image, []
+    views = some_views(4)
+
+    def failing(self: Renderer, camera: Camera, time: float, **options: int) -> object:
+        if time == views[2].time:
+            raise FloatingPointError("NaN")
+        return render(self, camera, time, **options)
+
+    monkeypatch.setattr(Renderer, "render_image", failing)
+    store = FrameStore(tmp_path, 4)
+    with pytest.raises(FloatingPointError, match="NaN"):
+        render_frames_to(store, make_renderer(), views, ["rgb"], on_frame=told.append)
+    assert told == [0, 1]
+    assert store.missing() == [2, 3]

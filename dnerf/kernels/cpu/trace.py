@@ -25,30 +25,11 @@ GOES_ON = 0  # between what ends a ray and what it may lack
 
 
 def trace(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    states: Tensor,
-    numbers: Tensor,
-    occupancy: Tensor,
-    skips: Tensor,
-    aabb: Tensor,
-    displacements: Tensor,
-    is_known: Tensor,
-    low: Tensor,
-    sides: Tensor,
-    slots: Tensor,
-    bricks: Tensor,
-    brick_low: Tensor,
-    waves: Tensor,
-    step: float,
-    splits: int,
-    min_weight: float,
-    cells_per_unit: float,
-    log_shift: float,
-    stop_transmittance: float,
+    numbers: Tensor, rays: list[Tensor], tables: list[Tensor], splits: int, scalars: list[float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    origins, directions, near, far, states = rays
+    occupancy, skips, aabb, displacements, is_known, low, sides, slots, bricks, brick_low, waves = tables
+    step, min_weight, cells_per_unit, log_shift, stop_transmittance = scalars
     states, numbers = states.clone(memory_format=torch.contiguous_format), numbers.clone()
     vertices, wanted = torch.zeros_like(is_known), torch.zeros_like(slots, dtype=torch.bool)
     o, d, t0, t1, box = (x.contiguous().numpy() for x in (origins, directions, near, far, aabb))
