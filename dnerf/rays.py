@@ -184,24 +184,34 @@ class Samples:
             ray_offsets=before[self.offsets],
         )
 
-    def split(self, count: int) -> "Samples":
+    def split(self, counts: int | Tensor) -> "Samples":
         """Packed samples, each interval cut into so many equal ones, the field asked in the middle of each.
 
+        Args:
+            counts: parts of every interval, or (N,) int64, of each.
+
         Raises:
-            ValueError: for dense samples, samples with points of their own, or a count below 1.
+            ValueError: for dense samples, samples with points of their own, or counts below 1.
         """
-        if self.ray_indices is None or self.points is not None or count < 1:
-            raise ValueError("samples must be packed, with their points in the middle, and cut into one part at least")
-        if count == 1:
-            return self
-        parts = torch.arange(count + 1, dtype=self.starts.dtype, device=self.starts.device) / count
-        edges = torch.lerp(self.starts[:, None], self.ends[:, None], parts)
+        if self.ray_indices is None or self.points is not None:
+            raise ValueError("samples must be packed, with their points in the middle, to be split")
+        if isinstance(counts, int):
+            if counts == 1:
+                return self
+            counts = torch.full_like(self.ray_indices, counts)
+        check_shape("counts", counts, self.starts.shape)
+        if not bool((counts >= 1).all()):
+            raise ValueError(f"counts must be at least 1, got {int(counts.min())}")
+        before = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+        whole = torch.repeat_interleave(counts, output_size=int(before[-1]))
+        number = torch.arange(len(whole), device=whole.device) - before[whole]
+        starts, ends, parts = self.starts[whole], self.ends[whole], counts[whole].to(self.starts.dtype)
         return replace(
             self,
-            starts=edges[:, :-1].reshape(-1),
-            ends=edges[:, 1:].reshape(-1),
-            ray_indices=self.ray_indices.repeat_interleave(count),
-            ray_offsets=self.offsets * count,
+            starts=torch.lerp(starts, ends, number / parts),  # exact at both ends
+            ends=torch.lerp(starts, ends, (number + 1) / parts),
+            ray_indices=self.ray_indices[whole],
+            ray_offsets=before[self.offsets],
         )
 
     def packed(self, mask: Tensor | None = None) -> "Samples":

@@ -108,9 +108,9 @@ class FrameTracer:
         while True:
             states, numbers, vertices, bricks = trace(
                 rays.origins, rays.directions, rays.near, rays.far, states, numbers, self._tables(),
-                step=self.grid.step, splits=self.grid.splits, min_weight=self.stop_transmittance,
+                step=self.grid.step, splits=self.grid.splits, split_weight=self.grid.split_weight,
+                min_weight=self.stop_transmittance, stop_transmittance=self.stop_transmittance,
                 cells_per_unit=self.canonical.cells_per_unit, log_shift=self.log_shift,
-                stop_transmittance=self.stop_transmittance,
             )  # fmt: skip
             if not self.canonical.make(bricks.nonzero()):
                 return states, numbers, vertices.view_as(self.deformation.is_known)

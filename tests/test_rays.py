@@ -117,6 +117,22 @@ def test_split_intervals_fill_what_they_were_cut_from(count: int) -> None:
     assert torch.equal(split.offsets, replace(split, ray_offsets=None).offsets)
 
 
+def test_each_interval_can_have_its_own_number_of_parts() -> None:
+    starts = torch.tensor([0.0, 1.0, 5.0])
+    packed = Samples(starts, starts + torch.tensor([1.0, 0.5, 3.0]), 4, ray_indices=torch.tensor([0, 0, 2]))
+    split = packed.split(torch.tensor([1, 2, 3]))
+    assert split.starts.tolist() == [0, 1, 1.25, 5, 6, 7]
+    assert split.ends.tolist() == [1, 1.25, 1.5, 6, 7, 8]
+    assert split.ray_indices is not None
+    assert split.ray_indices.tolist() == [0, 0, 0, 2, 2, 2]
+    assert split.offsets.tolist() == [0, 3, 3, 6, 6]
+    none = packed.kept(torch.zeros(3, dtype=torch.bool))
+    assert none.split(torch.zeros(0, dtype=torch.int64)).offsets.tolist() == [0] * 5
+    for wrong, message in ((torch.tensor([1, 0, 2]), "least 1, got 0"), (torch.ones(2), "must have shape"), (0, "0")):
+        with pytest.raises(ValueError, match=message):
+            packed.split(wrong)
+
+
 def test_dense_samples_are_neither_chosen_from_nor_split() -> None:
     dense = Samples(torch.zeros(2, 3), torch.ones(2, 3), 2)
     with pytest.raises(ValueError, match="must be packed to be chosen from"):

@@ -38,7 +38,9 @@ def model(
         deformation, canonical,
         frame_lattice=FrameLattice(box or BOX, 24), baking=Baking(BOX, 32, max_bricks=max_bricks),
     )  # fmt: skip
-    sampler = OccupancySampler(BOX, 0.03 * splits, 16, num_slabs=4, splits=splits, margin=0, pad_to=64)
+    sampler = OccupancySampler(
+        BOX, 0.03 * splits, 16, num_slabs=4, splits=splits, split_weight=0.02, margin=0, pad_to=64
+    )
     mask = torch.zeros(16, 16, 16, dtype=torch.bool)
     mask[5:11, 5:11, 4:12] = True
     sampler.occupy(mask)

@@ -34,6 +34,7 @@ class MarchGrid(NamedTuple):
         aabb: (2, 3), lower and upper corner of the box that the cells fill, in world units.
         step: length of an interval, in world units.
         splits: parts into which those in which something is seen are cut.
+        split_weight: weight in the picture up to which they are not.
     """
 
     occupancy: Tensor
@@ -41,6 +42,7 @@ class MarchGrid(NamedTuple):
     aabb: Tensor
     step: float
     splits: int = 1
+    split_weight: float = 0.0
 
 
 @torch.no_grad()

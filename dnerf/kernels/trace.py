@@ -99,6 +99,7 @@ def trace(
     step: float,
     splits: int,
     min_weight: float,
+    split_weight: float,
     cells_per_unit: float,
     log_shift: float,
     stop_transmittance: float,
@@ -107,9 +108,10 @@ def trace(
 
     Of an interval's middle x, the displacement d(x) is interpolated, then the contents at x + d(x), whose terms times
     `waves` sum up to a, b_1, b_2, b_3: density `exp(min(a + log_shift, 15))`, colour `sigmoid(b)`. They are composited
-    as `composite` does; if intervals are split, the parts of those whose weight exceeds `min_weight` are, and the
-    others are left out. A ray that needs a vertex or brick that is not known waits at that interval. Not
-    differentiable. It is the chain march, grid_encode, brick_lookup, composite without anything written in between.
+    as `composite` does; if intervals are split, those whose weight does not exceed `min_weight` are left out, those
+    up to `split_weight` are composited whole, and the parts of all others are. A ray that needs a vertex or brick that
+    is not known waits at that interval. Not differentiable. It is the chain march, grid_encode, brick_lookup, composite
+    without anything written in between.
 
     Args:
         origins: (R, 3), world units.
@@ -123,6 +125,7 @@ def trace(
         step: length of an interval, in world units.
         splits: parts of an interval.
         min_weight: see above; without effect if intervals are not split.
+        split_weight: likewise.
         cells_per_unit: of the bricks' lattice.
         log_shift: added to the logarithm of density.
         stop_transmittance: a ray ends once so little light is left.
@@ -146,7 +149,7 @@ def trace(
         if not number > 0:
             raise ValueError(f"{name} must be positive, got {number}")
     rays = [x.float() for x in (origins, directions, near, far, states)]
-    scalars = [float(x) for x in (step, min_weight, cells_per_unit, log_shift, stop_transmittance)]
+    scalars = [float(x) for x in (step, min_weight, split_weight, cells_per_unit, log_shift, stop_transmittance)]
     arguments = (numbers, rays, tables.tensors(), splits, scalars)
     return torch.ops.dnerf.trace(*arguments) if choose(rays[0]) == "numba" else trace_reference(*arguments)
 
@@ -161,11 +164,11 @@ def trace_reference(
         rays: origins, directions, near, far, states.
         tables: those of `FrameTables`, in their order.
         splits: see `trace`.
-        scalars: step, min_weight, cells_per_unit, log_shift, stop_transmittance.
+        scalars: step, min_weight, split_weight, cells_per_unit, log_shift, stop_transmittance.
     """
     origins, directions, near, far, states = rays
     occupancy, _, aabb, displacements, is_known, low, sides, slots, bricks, brick_low, waves = tables
-    step, min_weight, cells_per_unit, log_shift, stop_transmittance = scalars
+    step, min_weight, split_weight, cells_per_unit, log_shift, stop_transmittance = scalars
     still = torch.zeros_like(near)
     starts, ends, keep = kept_intervals(origins, directions, near, far, still, still, occupancy[None], aabb, step)
     states, numbers = states.clone(), numbers.clone()
@@ -213,9 +216,12 @@ def trace_reference(
         contents, why, brick = look(chosen, 0.5 * (first + ends[chosen, j]))
         able = stop(chosen, why, brick)
         chosen, contents, first, lengths = chosen[able], contents[able], first[able], lengths[able]
-        if splits > 1:
-            able = ~(states[chosen, 0] * opacities(contents, lengths) <= min_weight)  # NaN is seen
-            chosen, first, lengths = chosen[able], first[able], lengths[able] / splits
+        weights = states[chosen, 0] * opacities(contents, lengths)
+        is_whole = (weights > min_weight) & (weights <= split_weight) if splits > 1 else torch.ones_like(able[able])
+        add(chosen[is_whole], contents[is_whole], (first + 0.5 * lengths)[is_whole], lengths[is_whole])
+        able = ~is_whole & ~(weights <= min_weight)  # NaN is seen
+        chosen, first, lengths = chosen[able], first[able], lengths[able] / splits
+        if len(chosen):
             found = [look(chosen, first + (k + 0.5) * lengths) for k in range(splits)]
             why = torch.stack([why for _, why, _ in found])
             lacks = (why != 0).long().argmax(0)  # the first part that lacks something
@@ -224,8 +230,6 @@ def trace_reference(
             for k, (contents, _, _) in enumerate(found):
                 middles = first + (k + 0.5) * lengths
                 add(chosen[able], contents[able], middles[able], lengths[able])
-        else:
-            add(chosen, contents, first + 0.5 * lengths, lengths)
         numbers[goes_on] = torch.where(states[goes_on, 0] > stop_transmittance, j + 1, DONE)
     numbers[(numbers >= 0) & (numbers >= keep.shape[1])] = DONE
 

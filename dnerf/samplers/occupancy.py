@@ -13,7 +13,7 @@ from dnerf.geometry import cube_corners
 from dnerf.kernels import MarchGrid, march
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.occupancy_grid import OccupancyGrid
-from dnerf.samplers.visibility import joined, visible_samples
+from dnerf.samplers.visibility import joined, visible_weights
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
@@ -39,6 +39,8 @@ class OccupancySampler(OccupancyGrid):
             are cut into so many, at which the field is asked: empty and hidden ones are passed in long steps.
         render_splits: the same in evaluation mode; None for `splits`. A field that was learnt at intervals which begin
             anywhere is known between their middles too, and pictures gain from shorter ones.
+        split_weight: weight in the picture up to which an interval is not split, in [0, 1): what a surface's neighbours
+            and haze hold would cost as many samples as the surface itself.
         coarse_step: length of an interval when training begins; it shrinks evenly (by equal factors in equal progress)
             to `step_size`. Long intervals clear haze early and see more rays for the same samples, short ones
             sharpen surfaces later. None for `step_size` from the start; evaluation always takes `step_size`.
@@ -85,6 +87,7 @@ class OccupancySampler(OccupancyGrid):
         narrow_from: float = 1.0,
         splits: int = 1,
         render_splits: int | None = None,
+        split_weight: float = 0.0,
         min_weight: float = 0.0,
         filter_joins: int = 1,
         pad_to: int = 2048,
@@ -105,6 +108,8 @@ class OccupancySampler(OccupancyGrid):
             check_positive(name, value)
         if coarse_until > 1:
             raise ValueError(f"coarse_until must be in (0, 1], got {coarse_until}")
+        if not 0 <= split_weight < 1:
+            raise ValueError(f"split_weight must be in [0, 1), got {split_weight}")
         if not 0 <= narrow_from <= 1:
             raise ValueError(f"narrow_from must be in [0, 1], got {narrow_from}")
         self.step_size = step_size
@@ -113,6 +118,7 @@ class OccupancySampler(OccupancyGrid):
         self.training_step = self.coarse_step
         self.splits = splits
         self.render_splits = splits if render_splits is None else render_splits
+        self.split_weight = split_weight
         self.training_splits = 1
         self.narrow_from = narrow_from
         self.is_narrow = False
@@ -130,7 +136,9 @@ class OccupancySampler(OccupancyGrid):
             return samples.split(self.render_splits)
         if self.min_weight > 0:
             samples = self._visible(samples, rays, field)
-        return samples.split(self.training_splits).padded(self.pad_to)
+        else:
+            samples = samples.split(self.training_splits)
+        return samples.padded(self.pad_to)
 
     def first(self, rays: Rays, most: int) -> Samples | None:
         """In evaluation mode, the first samples of each ray; what lies behind is not marched through."""
@@ -140,14 +148,18 @@ class OccupancySampler(OccupancyGrid):
     def refined(
         self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
     ) -> Samples:
-        """The intervals whose weight exceeds `min_weight`, split; all of them, as they are, if pictures split none."""
+        """The intervals above `min_weight`, those above `split_weight` split; as they are, if pictures split none."""
         if self.render_splits == 1:
             return samples
         positions, _, times = samples.locate(rays)
         optical_depth = field.density(positions, times) * samples.lengths
         weights = render_weights(optical_depth, samples) * samples.per_sample(transmittance)
         is_seen = ~(weights <= min_weight)  # NaN is
-        return samples.kept(is_seen).split(self.render_splits).padded(self.pad_to)
+        return self._split(samples.kept(is_seen), weights[is_seen], self.render_splits).padded(self.pad_to)
+
+    def _split(self, samples: Samples, weights: Tensor, count: int) -> Samples:
+        """Samples of which those whose weight exceeds `split_weight` are cut into so many parts."""
+        return samples if count == 1 else samples.split(torch.where(weights <= self.split_weight, 1, count))
 
     def _march(self, rays: Rays, jitter: Tensor, most: int | None = None) -> Samples:
         occupied, skips = self.looked_into(self.is_narrow or not self.training)
@@ -180,7 +192,7 @@ class OccupancySampler(OccupancyGrid):
         occupied, skips = self.looked_into(is_narrow=True)
         slab = int(torch.tensor(time, dtype=dtype) * len(occupied))  # rounds as times of rays do
         slab = min(slab, len(occupied) - 1)
-        return MarchGrid(occupied[slab], skips[slab], self.box, self.step_size, self.render_splits)
+        return MarchGrid(occupied[slab], skips[slab], self.box, self.step_size, self.render_splits, self.split_weight)
 
     @torch.no_grad()
     def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
@@ -195,8 +207,11 @@ class OccupancySampler(OccupancyGrid):
 
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
         asked, number = joined(samples, self.filter_joins if self.training_splits == 1 else 1)
-        is_visible = visible_samples(
+        weights = visible_weights(
             asked, rays, field, self.min_weight,
             first_round=FIRST_ROUND, most_at_once=MOST_AT_ONCE, pad_to=self.pad_to, observe=self.observe,
         )  # fmt: skip
-        return samples.kept(is_visible[number])
+        weights = weights[number]
+        is_visible = weights > self.min_weight
+        kept = samples.kept(is_visible)
+        return self._split(kept, weights[is_visible], self.training_splits)

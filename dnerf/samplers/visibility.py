@@ -89,7 +89,7 @@ class PackedRounds:
 
 
 @torch.no_grad()
-def visible_samples(
+def visible_weights(
     samples: Samples,
     rays: Rays,
     field: RadianceField,
@@ -100,25 +100,26 @@ def visible_samples(
     pad_to: int = 1,
     observe: Observer | None = None,
 ) -> Tensor:
-    """Ask the field's density front to back and mark the samples whose weight exceeds `min_weight`.
+    """Ask the field's density front to back for the samples' weights in the picture.
 
-    A picture of the marked samples alone differs from that of all by at most `min_weight` for each sample in front
-    and `min_weight` for all behind. As a filter before the pass with gradients it is nerfacc's (arXiv 2305.04966).
+    A picture of the samples above `min_weight` alone differs from that of all by at most `min_weight` for each sample
+    in front and `min_weight` for all behind. As a filter before the pass with gradients it is nerfacc's (arXiv
+    2305.04966).
 
     Args:
         samples: N packed samples of the rays.
         rays: R rays.
         field: whose density decides.
-        min_weight: least weight that counts, in (0, 1).
+        min_weight: least weight that counts, in (0, 1); a ray whose transmittance has fallen to this is at its end.
         first_round: samples per ray in the first round, see `walk_front_to_back`.
         most_at_once: samples of all rays in a round, likewise; if there are no more, all may be one.
         pad_to: the field is asked a multiple of so many points.
         observe: told positions (n, 3), times (n,) and density (n,) of every round.
 
     Returns:
-        (N,) bool.
+        (N,), zero behind the end of a ray.
     """
-    marked = torch.zeros_like(samples.starts, dtype=torch.bool)
+    found = torch.zeros_like(samples.starts)
 
     rounds = PackedRounds(samples, pad_to)
 
@@ -129,7 +130,7 @@ def visible_samples(
             observe(positions, times, density)
         optical_depth = density * part.lengths
         weights = render_weights(optical_depth, part) * part.per_sample(transmittance)
-        marked[rounds.chosen] = weights[: len(rounds.chosen)] > min_weight
+        found[rounds.chosen] = weights[: len(rounds.chosen)]
         return torch.exp(-sum_along_rays(optical_depth, part))
 
     is_few = samples.starts.numel() <= most_at_once
@@ -137,7 +138,7 @@ def visible_samples(
         rounds, rounds.rays, min_weight, visit,
         first_round=first_round, most_at_once=first_round * len(rays) if is_few else most_at_once,
     )  # fmt: skip
-    return marked
+    return found
 
 
 @torch.no_grad()

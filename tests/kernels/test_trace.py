@@ -10,7 +10,8 @@ from dnerf.kernels.grid_encode import GridLevels
 
 BOX = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 0.5, 1.5]])
 PER_UNIT = 12.0
-OPTIONS = {"step": 0.05, "splits": 1, "min_weight": 0.0, "cells_per_unit": PER_UNIT, "log_shift": 1.0}
+OPTIONS = {"step": 0.05, "splits": 1, "min_weight": 0.0, "split_weight": 0.0}
+OPTIONS |= {"cells_per_unit": PER_UNIT, "log_shift": 1.0}
 
 
 def tables(seed=0, known=1.0, bricks=1.0, share=0.3, num_terms=2, reach=0.15, cells=(5, 4, 6)):
@@ -60,7 +61,7 @@ def fresh(count):
     return states, torch.zeros(count, dtype=torch.int64)
 
 
-def chain(bundle, scene, *, step, cells_per_unit, log_shift, splits=1, min_weight=0.0):
+def chain(bundle, scene, *, step, cells_per_unit, log_shift, splits, min_weight, split_weight):
     """The same light by march, grid_encode and brick_lookup, added up ray by ray in float64."""
     origins, directions, near, _ = bundle
     zeros = torch.zeros_like(near)
@@ -79,17 +80,21 @@ def chain(bundle, scene, *, step, cells_per_unit, log_shift, splits=1, min_weigh
         return torch.exp((terms[:, 0] + log_shift).clamp(max=15)), torch.sigmoid(terms[:, 1:])
 
     states = fresh(len(near))[0].double()
-    coarse = look(samples.ray_indices, 0.5 * (samples.starts + samples.ends))[0]
+    middles = (0.5 * (samples.starts + samples.ends),)
+    coarse = look(samples.ray_indices, *middles)
+    middles += coarse
     lengths = (samples.ends - samples.starts) / splits
     parts = []
     for k in range(splits):
         distances = samples.starts + (k + 0.5) * lengths
         parts.append((distances, *look(samples.ray_indices, distances)))
     for i, r in enumerate(samples.ray_indices.tolist()):
-        if splits > 1 and states[r, 0] * -torch.expm1(-coarse[i] * lengths[i] * splits) <= min_weight:
+        weight = states[r, 0] * -torch.expm1(-coarse[0][i] * lengths[i] * splits)
+        if splits > 1 and weight <= min_weight:
             continue
-        for distances, density, rgb in parts:
-            opacity = -torch.expm1(-density[i] * lengths[i])
+        is_whole = splits > 1 and weight <= split_weight
+        for distances, density, rgb in [middles] if is_whole else parts:
+            opacity = -torch.expm1(-density[i] * lengths[i] * (splits if is_whole else 1))
             states[r, 1:4] += states[r, 0] * opacity * rgb[i]
             states[r, 4] += states[r, 0] * opacity * distances[i]
             states[r, 0] *= 1 - opacity
@@ -97,10 +102,13 @@ def chain(bundle, scene, *, step, cells_per_unit, log_shift, splits=1, min_weigh
 
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
-@pytest.mark.parametrize(("splits", "min_weight"), [(1, 0.0), (3, 0.0), (2, 0.05)])
-def test_it_is_the_chain_of_its_parts(backend, splits, min_weight):
+@pytest.mark.parametrize(
+    ("splits", "min_weight", "split_weight"),
+    [(1, 0.0, 0.0), (1, 0.1, 0.5), (3, 0.0, 0.0), (2, 0.05, 0.0), (3, 0.01, 0.2), (3, 0.2, 0.1)],
+)
+def test_it_is_the_chain_of_its_parts(backend, splits, min_weight, split_weight):
     bundle, scene = rays(150), tables()
-    options = OPTIONS | {"splits": splits, "min_weight": min_weight}
+    options = OPTIONS | {"splits": splits, "min_weight": min_weight, "split_weight": split_weight}
     with kernels.use_backend(backend):
         states, numbers, vertices, bricks = trace(*bundle, *fresh(150), scene, **options, stop_transmittance=0.0)
     assert (numbers == -1).all()
@@ -118,14 +126,15 @@ def test_it_is_the_chain_of_its_parts(backend, splits, min_weight):
     reach=st.sampled_from([0.0, 0.1, 0.6]),
     splits=st.integers(1, 4),
     min_weight=st.sampled_from([0.0, 0.01]),
+    split_weight=st.sampled_from([0.0, 0.1]),
     stop=st.sampled_from([0.0, 0.1]),
     num_terms=st.integers(1, 4),
     seed=st.integers(0, 99),
 )
-def test_numba_equals_reference(count, known, bricks, reach, splits, min_weight, stop, num_terms, seed):
+def test_numba_equals_reference(count, known, bricks, reach, splits, min_weight, split_weight, stop, num_terms, seed):
     bundle = rays(count, seed)
     scene = tables(seed, known=known, bricks=bricks, reach=reach, num_terms=num_terms)
-    options = OPTIONS | {"splits": splits, "min_weight": min_weight}
+    options = OPTIONS | {"splits": splits, "min_weight": min_weight, "split_weight": split_weight}
     found = {}
     for backend in ("reference", "numba"):
         with kernels.use_backend(backend):
@@ -198,7 +207,7 @@ def test_bricks_behind_opaque_matter_are_not_wanted(backend):
 def test_op_is_registered_properly():
     bundle, scene = rays(10), tables()
     states, numbers = fresh(10)
-    scalars = [0.05, 1e-3, PER_UNIT, 1.0, 1e-3]
+    scalars = [0.05, 1e-3, 0.05, PER_UNIT, 1.0, 1e-3]
     torch.library.opcheck(torch.ops.dnerf.trace, (numbers, [*bundle, states], scene.tensors(), 2, scalars))
 
 

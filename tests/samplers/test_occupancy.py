@@ -9,7 +9,7 @@ from reference import FormulaField, fog, rays_towards_origin
 from torch import Tensor
 
 from dnerf.cameras import Camera, Intrinsics, look_at
-from dnerf.compositing import FieldOutput, composite
+from dnerf.compositing import FieldOutput, composite, render_weights
 from dnerf.fields import RadianceField
 from dnerf.kernels import skip_distances
 from dnerf.rays import Rays
@@ -128,6 +128,25 @@ def test_training_splits_what_is_seen_once_intervals_have_their_length() -> None
         assert length() == pytest.approx(0.004, rel=1e-3)
 
 
+def test_what_weighs_little_stays_whole() -> None:
+    """A step of fog of density 1 weighs up to 0.02, and less the more lies in front."""
+    rays, lengths = rays_towards_origin(20), {}
+    for split_weight in (0.0, 0.015, 0.5):
+        sampler = small(splits=4, min_weight=1e-4, split_weight=split_weight).train()
+        sampler.set_progress(1.0)
+        samples = sampler(rays, fog(1.0), generator=torch.Generator().manual_seed(0))
+        lengths[split_weight] = samples.lengths[samples.lengths > 0]
+        assert float(samples.lengths.sum()) == pytest.approx(float(lengths[0.0].sum()), rel=1e-3)
+        if split_weight == 0.015:
+            weights = render_weights(samples.lengths, samples)
+            is_part = samples.lengths < 0.006
+            assert weights[~is_part].max() <= 0.015 * 1.001
+            assert weights[is_part & (samples.lengths > 0.0049)].min() >= 0.015 / 4 * 0.98
+            assert 0.1 < is_part.float().mean() < 0.9
+    assert (lengths[0.0] < 0.006).all()
+    assert (lengths[0.5] > 0.006).float().mean() > 0.9
+
+
 def test_pictures_ask_where_something_is_seen_at_short_intervals() -> None:
     """The picture of long marched intervals, split, is that of short ones, up to what the filter leaves out."""
     camera = Camera(Intrinsics(24, 24, 30.0, 30.0), look_at([0.0, -3.0, 0.5], [0.0, 0.0, 0.0]))
@@ -242,6 +261,8 @@ def test_grid_is_saved_with_the_model() -> None:
         ({"coarse_step": 0.0}, "coarse_step must be > 0"),
         ({"coarse_until": 1.5}, r"coarse_until must be in \(0, 1\]"),
         ({"splits": 0}, "^splits must be > 0"),
+        ({"split_weight": 1.0}, r"split_weight must be in \[0, 1\), got 1.0"),
+        ({"split_weight": math.nan}, r"split_weight must be in \[0, 1\), got nan"),
         ({"render_splits": 0}, "render_splits must be > 0"),
         ({"narrow_from": 1.5}, r"narrow_from must be in \[0, 1\]"),
         ({"filter_joins": 0}, "filter_joins must be > 0"),

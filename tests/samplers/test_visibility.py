@@ -14,7 +14,7 @@ from dnerf.compositing import composite
 from dnerf.fields import RadianceField
 from dnerf.rays import Rays, Samples
 from dnerf.samplers import OccupancySampler
-from dnerf.samplers.visibility import joined, visible_samples
+from dnerf.samplers.visibility import joined, visible_weights
 
 
 class CountingField(FormulaField):
@@ -73,21 +73,23 @@ def table_field(samples: Samples, values: Tensor) -> RadianceField:
     st.sampled_from([1, 16]),
     st.sampled_from([1, 7, 1 << 20]),
 )
-def test_marks_are_those_of_a_loop_over_all_weights(
+def test_weights_are_those_of_a_loop(
     counts: list[int], seed: int, min_weight: float, first_round: int, pad_to: int, most_at_once: int
 ) -> None:
-    """Whatever the rounds: kept is what has weight and lies where light still arrives."""
+    """Whatever the rounds, up to where so little light arrives that nothing can weigh more than `min_weight`."""
     rays, samples = packed(counts)
     draw = torch.Generator().manual_seed(seed)
     densities = 10 ** (torch.rand(sum(counts), generator=draw, dtype=torch.float64) * 8 - 5)
-    marked = visible_samples(
+    weights = visible_weights(
         samples, rays, table_field(samples, densities), min_weight,
         first_round=first_round, pad_to=pad_to, most_at_once=most_at_once,
     )  # fmt: skip
     expected = []
     for values in densities.split(counts):
-        expected += [weight > min_weight for weight in ray_weights([0.1 * v for v in values.tolist()])]
-    assert marked.tolist() == expected
+        expected += ray_weights([0.1 * v for v in values.tolist()])
+    wanted = torch.tensor(expected, dtype=torch.float64)
+    assert torch.equal(weights > min_weight, wanted > min_weight)
+    torch.testing.assert_close(torch.where(weights > 0, weights, wanted), wanted, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("min_weight", [1e-2, 1e-3, 1e-4])
@@ -110,13 +112,13 @@ def test_what_lies_behind_a_surface_is_not_even_asked() -> None:
     rays = rays_towards_origin(64)
     field = ball()
     samples = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, pad_to=1).eval()(rays, field)
-    marked = visible_samples(samples, rays, field, 1e-4)
+    is_seen = visible_weights(samples, rays, field, 1e-4) > 1e-4
     assert field.num_points < 0.5 * len(samples.starts)
     # Density 200 over steps of 0.02: three intervals leave exp(-12) of the light.
     inside = samples.positions(rays).norm(dim=-1) < 0.9
-    assert not (marked & ~inside).any()
-    assert marked.any()
-    assert torch.bincount(samples.ray_indices[marked], minlength=64).max() <= 3
+    assert not (is_seen & ~inside).any()
+    assert is_seen.any()
+    assert torch.bincount(samples.ray_indices[is_seen], minlength=64).max() <= 3
 
 
 def test_a_thin_start_keeps_every_sample() -> None:
@@ -216,7 +218,7 @@ def test_haze_is_asked_in_rounds_of_bounded_size() -> None:
 
     rays, samples = packed([50] * 30)
     field = Haze(lambda x: x[..., 0], lambda x, d, t: x)
-    visible_samples(samples, rays, field, 1e-6, first_round=64, most_at_once=100)
+    visible_weights(samples, rays, field, 1e-6, first_round=64, most_at_once=100)
     assert sum(sizes) == 1500
     assert max(sizes) <= 100
 

@@ -29,7 +29,7 @@ def trace(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     origins, directions, near, far, states = rays
     occupancy, skips, aabb, displacements, is_known, low, sides, slots, bricks, brick_low, waves = tables
-    step, min_weight, cells_per_unit, log_shift, stop_transmittance = scalars
+    step, min_weight, split_weight, cells_per_unit, log_shift, stop_transmittance = scalars
     states, numbers = states.clone(memory_format=torch.contiguous_format), numbers.clone()
     vertices, wanted = torch.zeros_like(is_known), torch.zeros_like(slots, dtype=torch.bool)
     o, d, t0, t1, box = (x.contiguous().numpy() for x in (origins, directions, near, far, aabb))
@@ -51,7 +51,7 @@ def trace(
             slots_, bricks_.reshape(len(bricks) * VERTICES, bricks.shape[2]), brick_low_, np.float32(cells_per_unit),
             waves_, np.float32(log_shift),
         ),
-        (splits, np.float32(min_weight), np.float32(stop_transmittance)),
+        (splits, np.float32(min_weight), np.float32(split_weight), np.float32(stop_transmittance)),
         states.numpy(),
         numbers.numpy(),
         vertices.numpy(),
@@ -168,16 +168,22 @@ def _composite(
     lanes: Any,
 ) -> Any:
     """Composite gathered intervals behind a ray's state; where it goes no further, and why not."""
-    splits, min_weight, stop_transmittance = options
+    splits, min_weight, split_weight, stop_transmittance = options
     spans, numbers = intervals
     for i in range(size):
         start, end = spans[i]
         opacity = _opacity(found, i, end - start, contents, values, lanes)
-        if splits == 1:
+        weight = state[0] * opacity
+        if splits == 1 or min_weight < weight <= split_weight:
             _add(state, opacity, np.float32(0.5) * (start + end), values, contents[4])
-        elif not state[0] * opacity <= min_weight:  # NaN is seen
+        elif not weight <= min_weight:  # NaN is seen
             length = (end - start) / np.float32(splits)
             for k in range(splits):
+                if 2 * k + 1 == splits:  # its middle is the interval's
+                    parts[0][k] = found[0][i]
+                    for axis in range(3):
+                        parts[1][k, axis] = found[1][i, axis]
+                    continue
                 why = _find(_part(start, k, length), course, lattice, contents, parts, k, moved)
                 if why != GOES_ON:
                     return numbers[i], why
