@@ -29,6 +29,7 @@ KNOBS = {
     "cut-off": "transmittance at which a ray ends",
     "step": "step along a ray (world units)",
     "splits": "shortest steps in a marched one, which is split where something is seen, with the cut-off",
+    "split weight": "weight in the picture up to which an interval is not split, with the cut-off",
     "lattice": "cells of the lattice that the deformation is kept on",
     "baking": "cells of the lattice that canonical space is kept on",
 }
@@ -158,6 +159,9 @@ def _settings(
         yield Setting("step", value, changed(step_size=value))
     for value in options["splits"][few]:
         yield Setting("splits", value, changed(step_size=value * _shortest(trained), render_splits=value), cut)
+    own_splits = {"step_size": trained.step_size, "render_splits": trained.render_splits}
+    for value in options["split_weights"][few] if trained.render_splits > 1 else []:
+        yield Setting("split weight", value, changed(**own_splits, split_weight=value), cut)
     for value in options["cuts"][few]:
         yield Setting("cut-off", value, trained, value)
     for value in options["lattices"][few]:
@@ -230,7 +234,7 @@ def _plot(rows: list[dict[str, Any]], knob: str) -> Plot:
         style = "line" if name == knob else "points"
         series.append(Series(name, x, y, x_low=low, x_high=high, notes=notes, style=style))
     return Plot(
-        name=f"pruning_{knob}",
+        name=f"pruning_{knob.replace(' ', '_')}",
         title=f"Error against time: {KNOBS[knob]}",
         x_label="time per frame (ms)",
         y_label="root-mean-square difference from leaving out nothing",
