@@ -89,31 +89,33 @@ class FrameTracer:
         states[:, 0] = 1
         numbers = torch.full((len(rays),), DONE, device=states.device)
         numbers[::PIONEERS] = 0
-        states, numbers, vertices = self._followed(rays, states, numbers)
-        self.deformation.fill(vertices)
+        self.deformation.fill(self._follow(rays, states, numbers))
         numbers[torch.arange(len(rays), device=states.device) % PIONEERS > 0] = 0
-        while True:
-            states, numbers, vertices = self._followed(rays, states, numbers)
-            if not self.deformation.fill(vertices):
-                break
+        while self.deformation.fill(self._follow(rays, states, numbers)):
+            pass
         is_done = numbers == DONE
         sums = torch.cat([states[:, 1:], 1 - states[:, :1]], dim=-1)
         return torch.where(is_done[:, None], sums, 0).to(rays.origins.dtype), is_done
 
-    def _followed(self, rays: Rays, states: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """States and numbers of rays as far as the vertices that are known let them come, and those that are wanted.
+    def _follow(self, rays: Rays, states: Tensor, numbers: Tensor) -> Tensor:
+        """Take the states and numbers of rays as far as the vertices that are known let them come.
 
         Which vertices are asked for together depends on the frame alone, not on the bricks that frames before it left.
+
+        Returns:
+            The vertices that are wanted, as the deformation's.
         """
         while True:
-            states, numbers, vertices, bricks = trace(
-                rays.origins, rays.directions, rays.near, rays.far, states, numbers, self._tables(),
+            waiting = (numbers >= 0).nonzero()[:, 0]
+            some = rays[waiting]
+            states[waiting], numbers[waiting], vertices, bricks = trace(
+                some.origins, some.directions, some.near, some.far, states[waiting], numbers[waiting], self._tables(),
                 step=self.grid.step, splits=self.grid.splits, split_weight=self.grid.split_weight,
                 min_weight=self.stop_transmittance, stop_transmittance=self.stop_transmittance,
                 cells_per_unit=self.canonical.cells_per_unit, log_shift=self.log_shift,
             )  # fmt: skip
             if not self.canonical.make(bricks.nonzero()):
-                return states, numbers, vertices.view_as(self.deformation.is_known)
+                return vertices.view_as(self.deformation.is_known)
 
     def _tables(self) -> FrameTables:
         return FrameTables(

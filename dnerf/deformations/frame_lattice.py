@@ -8,6 +8,7 @@ from torch import Tensor
 from dnerf.checks import as_box, check_positive
 from dnerf.deformations.base import Deformation, check_positions_times
 from dnerf.kernels import GridLevels, grid_encode
+from dnerf.sparse import few_nonzero
 
 
 class FrameLattice:
@@ -111,15 +112,15 @@ class FrozenDeformation(Deformation):
         Returns:
             Whether there were any.
         """
-        places = wanted.nonzero()
+        places = few_nonzero(wanted)
         if not len(places):
             return False
-        padded = torch.cat([places, places[-1:].expand(-len(places) % self.pad_to, 3)])
+        padded = torch.cat([places, places[-1:].expand(-len(places) % self.pad_to)])
+        rows, columns = wanted.shape[1:]
+        grid = torch.stack([padded % columns, padded // columns % rows, padded // (columns * rows)], dim=-1)
         size = torch.tensor(self.levels.cells, device=places.device)
-        vertices = self.low + self.sides * padded.flip(-1) / size
+        vertices = self.low + self.sides * grid / size
         displaced = self.deformation(vertices, vertices.new_full((len(vertices),), self.time)) - vertices
-        self.displacements.view(*self.is_known.shape, 4)[(*places.unbind(-1),)] = torch.nn.functional.pad(
-            displaced[: len(places)].float(), (0, 1)
-        )
-        self.is_known |= wanted
+        self.displacements[places] = torch.nn.functional.pad(displaced[: len(places)].float(), (0, 1))
+        self.is_known.view(-1)[places] = True
         return True

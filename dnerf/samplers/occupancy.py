@@ -14,6 +14,7 @@ from dnerf.kernels import MarchGrid, march
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.samplers.visibility import joined, visible_weights
+from dnerf.sparse import few_nonzero
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
@@ -201,7 +202,9 @@ class OccupancySampler(OccupancyGrid):
         So a frame costs what the body covers, not what the picture holds. No pixel is lost: cells are convex, so the
         rectangle around a cell's corners holds all of it.
         """
-        lowest = self.grid_at(time, camera.pose.dtype).occupancy.nonzero()
+        occupied = self.grid_at(time, camera.pose.dtype).occupancy
+        places, (_, rows, columns) = few_nonzero(occupied), occupied.shape
+        lowest = torch.stack([places // (columns * rows), places // columns % rows, places % columns], dim=-1)
         unit = (lowest[:, None] + cube_corners(lowest.device)) / self.shape[1:]
         return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
 
