@@ -116,8 +116,7 @@ class FrozenDeformation(Deformation):
         if not len(places):
             return False
         padded = torch.cat([places, places[-1:].expand(-len(places) % self.pad_to)])
-        rows, columns = wanted.shape[1:]
-        grid = torch.stack([padded % columns, padded // columns % rows, padded // (columns * rows)], dim=-1)
+        grid = torch.stack(torch.unravel_index(padded, wanted.shape), dim=-1).flip(-1)
         size = torch.tensor(self.levels.cells, device=places.device)
         vertices = self.low + self.sides * grid / size
         displaced = self.deformation(vertices, vertices.new_full((len(vertices),), self.time)) - vertices

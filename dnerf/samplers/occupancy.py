@@ -203,8 +203,7 @@ class OccupancySampler(OccupancyGrid):
         rectangle around a cell's corners holds all of it.
         """
         occupied = self.grid_at(time, camera.pose.dtype).occupancy
-        places, (_, rows, columns) = few_nonzero(occupied), occupied.shape
-        lowest = torch.stack([places // (columns * rows), places // columns % rows, places % columns], dim=-1)
+        lowest = torch.stack(torch.unravel_index(few_nonzero(occupied), occupied.shape), dim=-1)
         unit = (lowest[:, None] + cube_corners(lowest.device)) / self.shape[1:]
         return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
 
