@@ -11,6 +11,7 @@ from dnerf.kernels.backend import choose
 from dnerf.kernels.trace import DONE, NUM_STATES
 from dnerf.rays import Rays
 
+VERTICES_PER_RAY = 4  # most to ask around all occupied cells, instead of finding out which of them rays want
 PIONEERS = 5  # one ray of so many is sent ahead once, to find what most of its neighbours will want
 
 
@@ -87,15 +88,28 @@ class FrameTracer:
             part.move_to(rays.origins.device)
         states = torch.zeros(len(rays), NUM_STATES, device=rays.origins.device)
         states[:, 0] = 1
-        numbers = torch.full((len(rays),), DONE, device=states.device)
-        numbers[::PIONEERS] = 0
-        self.deformation.fill(self._follow(rays, states, numbers))
-        numbers[torch.arange(len(rays), device=states.device) % PIONEERS > 0] = 0
+        numbers = torch.zeros(len(rays), dtype=torch.int64, device=states.device)
+        self._fill_ahead(rays, states, numbers)
         while self.deformation.fill(self._follow(rays, states, numbers)):
             pass
         is_done = numbers == DONE
         sums = torch.cat([states[:, 1:], 1 - states[:, :1]], dim=-1)
         return torch.where(is_done[:, None], sums, 0).to(rays.origins.dtype), is_done
+
+    def _fill_ahead(self, rays: Rays, states: Tensor, numbers: Tensor) -> None:
+        """Fill most of what fresh rays will want at once, since every round of asking has its price.
+
+        That is what lies around occupied cells. Where matter is not few cells but haze, rays see little of it: some of
+        them are followed ahead as far as they come, and what they want is filled.
+        """
+        around = self.deformation.vertices_around(self.grid.occupancy, self.grid.aabb) & ~self.deformation.is_known
+        if int(around.sum()) <= VERTICES_PER_RAY * len(rays):
+            self.deformation.fill(around)
+            return
+        numbers.fill_(DONE)
+        numbers[::PIONEERS] = 0
+        self.deformation.fill(self._follow(rays, states, numbers))
+        numbers[torch.arange(len(rays), device=states.device) % PIONEERS > 0] = 0
 
     def _follow(self, rays: Rays, states: Tensor, numbers: Tensor) -> Tensor:
         """Take the states and numbers of rays as far as the vertices that are known let them come.

@@ -77,6 +77,24 @@ def test_it_shows_what_the_chain_shows(time_terms: int, splits: int) -> None:
     torch.testing.assert_close(shown, expected, rtol=0, atol=1e-3)
 
 
+def test_what_is_filled_ahead_is_most_of_it_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    fill = FrozenDeformation.fill
+
+    def counted(self: FrozenDeformation, wanted: Tensor) -> bool:
+        asked.append(int(wanted.sum()))
+        return fill(self, wanted)
+
+    monkeypatch.setattr(FrozenDeformation, "fill", counted)
+    monkeypatch.setattr("dnerf.tracing.VERTICES_PER_RAY", 100)  # all around occupied cells
+    ahead = picture(model(splits=3))
+    assert asked[0] > 0.9 * sum(asked)
+    asked.clear()
+    monkeypatch.setattr("dnerf.tracing.VERTICES_PER_RAY", 0)  # rays find what they want
+    torch.testing.assert_close(ahead, picture(model(splits=3)), rtol=0, atol=1e-6)
+    assert asked[0] < 0.9 * sum(asked)
+
+
 def test_frames_do_not_depend_on_those_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which vertices are asked together depends on a frame alone: other numbers of rows may round otherwise."""
     asked: list[int] = []

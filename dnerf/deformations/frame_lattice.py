@@ -106,6 +106,24 @@ class FrozenDeformation(Deformation):
         self.fill(needed & ~self.is_known)
 
     @torch.no_grad()
+    def vertices_around(self, occupied: Tensor, aabb: Tensor) -> Tensor:
+        """Vertices (Lz + 1, Ly + 1, Lx + 1), bool, of the lattice's cells that share space with cells of another grid.
+
+        Args:
+            occupied: (Gx, Gy, Gz) bool, which of the other grid's.
+            aabb: (2, 3) box that the other grid fills, in world units.
+        """
+        covered = []
+        for axis, (size, cells) in enumerate(zip(occupied.shape, self.levels.cells, strict=True)):
+            faces = torch.lerp(aabb[0, axis], aabb[1, axis], torch.linspace(0, 1, size + 1, device=aabb.device))
+            vertex = torch.arange(cells + 1, device=aabb.device)[:, None]
+            place = (faces - self.low[axis]) / self.sides[axis] * cells
+            covered.append(((place[:-1].floor() <= vertex) & (vertex <= place[1:].ceil())).float())
+        x, y, z = covered  # (vertices, cells of the other grid)
+        reached = y @ (occupied.permute(2, 1, 0).float() @ x.T)
+        return (z @ reached.flatten(1) > 0).view_as(self.is_known)
+
+    @torch.no_grad()
     def fill(self, wanted: Tensor) -> bool:
         """Ask the deformation at the vertices (Lz + 1, Ly + 1, Lx + 1) that are wanted, bool.
 

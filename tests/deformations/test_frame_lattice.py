@@ -67,6 +67,24 @@ def test_only_cells_with_points_are_asked() -> None:
     assert bend.num_points == 12
 
 
+def test_vertices_around_cells_are_those_that_points_in_them_ask_for() -> None:
+    size, aabb = (7, 5, 6), torch.tensor([[-0.93, -1.21, -0.64], [1.17, 0.88, 0.41]])  # partly outside
+    occupied = torch.rand(size, generator=torch.Generator().manual_seed(3)) < 0.05
+    cells = occupied.nonzero()
+    assert len(cells)
+    lattice = FrameLattice(BOX, 12)
+    inside = torch.linspace(1e-4, 1 - 1e-4, 30)
+    offsets = torch.cartesian_prod(inside, inside, inside)
+    points = torch.lerp(*aabb, ((cells[:, None] + offsets) / torch.tensor(size)).reshape(-1, 3))
+    low, high = torch.tensor(BOX)
+    points = points[((points > low) & (points < high)).all(-1)]
+    asked = lattice.at_time(IdentityDeformation(), 0.5)
+    asked(points, points.new_full((len(points),), 0.5))
+    found = lattice.at_time(IdentityDeformation(), 0.5).vertices_around(occupied, aabb)
+    assert torch.equal(found, asked.is_known)
+    assert not lattice.at_time(IdentityDeformation(), 0.5).vertices_around(occupied & False, aabb).any()
+
+
 def test_outside_its_box_the_deformation_itself_is_asked() -> None:
     x = points(50, 3, torch.float32) * 3
     times = torch.full((50,), 0.3)
