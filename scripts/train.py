@@ -35,9 +35,9 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     """Build data, model and trainer; train; save weights, logs and scores in the run's folder."""
     torch.manual_seed(config.seed)
     data = build(config.data)
-    frames = data.frames("train")
     renderer = build(config.renderer).to(device)
     trainer = build(config.trainer)
+    frames = data.frames("train")  # after what can be refused in no time: exact frames are rendered first
     num_parameters = sum(p.numel() for p in renderer.parameters())
     name = processes.from_first(lambda: str(held.enter_context(opened(config))).encode())
     assert name is not None
