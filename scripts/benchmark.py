@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from hydra import compose
-from hydra_app import build, resolve_device, run_app
+from hydra_app import build, load_config, load_renderer, resolve_device, run_app
 from omegaconf import DictConfig, OmegaConf
 
 from dnerf.benchmarks import Settings, describe_machine, run_suite, suite_names, write_report
@@ -43,6 +43,7 @@ def _run(config: DictConfig, suite: str, folder: Path) -> None:
         work_dir=Path("runs/benchmark") / f"{suite}_work",
         train_command=(sys.executable, str(Path(__file__).with_name("train.py"))),
         build=_parts,
+        load=_finished,
         options={"data_root": config.data_root, **section.get(suite, {})},
     )
     machine = describe_machine()
@@ -58,9 +59,16 @@ def _run(config: DictConfig, suite: str, folder: Path) -> None:
 
 
 def _parts(overrides: Sequence[str]) -> Mapping[str, Any]:
-    """Renderer, trainer and data of a training config with the given overrides."""
+    """Renderer, trainer, data and chunk of a training config with the given overrides."""
     config = compose("train", list(overrides))
-    return {name: build(config[name]) for name in ("renderer", "trainer", "data")}
+    return {"chunk": config.chunk, **{name: build(config[name]) for name in ("renderer", "trainer", "data")}}
+
+
+def _finished(run: str) -> Mapping[str, Any]:
+    """Renderer, data and chunk of a finished run."""
+    config = load_config(run)
+    renderer = load_renderer(run, config, torch.device("cpu"))
+    return {"renderer": renderer, "data": build(config.data), "chunk": config.chunk}
 
 
 if __name__ == "__main__":

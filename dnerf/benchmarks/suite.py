@@ -137,7 +137,8 @@ class Settings:
         device: "cpu" or "cuda".
         work_dir: a folder for runs and other files that nobody keeps.
         train_command: how a training run is started in a process of its own, overrides to be appended.
-        build: config overrides of a training run -> its parts by name ("renderer", "trainer", "data"), built.
+        build: config overrides of a training run -> its parts by name ("renderer", "trainer", "data", "chunk"), built.
+        load: folder of a finished run -> its parts by name ("renderer", "data", "chunk"), read.
         options: further values of this suite's section of the config.
     """
 
@@ -147,6 +148,7 @@ class Settings:
     work_dir: Path = Path("runs/benchmark")
     train_command: Sequence[str] = ()
     build: Callable[[Sequence[str]], Mapping[str, Any]] | None = None
+    load: Callable[[str], Mapping[str, Any]] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def parts(self, *overrides: str) -> Mapping[str, Any]:
@@ -158,6 +160,16 @@ class Settings:
         if self.build is None:
             raise ValueError("build must be given to the settings of a suite that measures whole models, got None")
         return self.build(overrides)
+
+    def finished(self, run: str) -> Mapping[str, Any]:
+        """Renderer, data and chunk of a finished run.
+
+        Raises:
+            ValueError: if whoever made the settings cannot read runs, or for a folder that is none.
+        """
+        if self.load is None:
+            raise ValueError("load must be given to the settings of a suite that measures finished runs, got None")
+        return self.load(run)
 
 
 def suite_names() -> list[str]:

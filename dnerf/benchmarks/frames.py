@@ -1,0 +1,142 @@
+"""What a frame of a finished model takes, alone and in a sequence, and how near it comes to the truth."""
+
+import copy
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dnerf.benchmarks.scenes import scene_overrides
+from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
+from dnerf.benchmarks.timing import time_in_turn
+from dnerf.data.frames import Frames
+from dnerf.metrics import psnr
+from dnerf.renderer import FRAMES_THAT_SHARE, Renderer
+from dnerf.samplers import OccupancySampler
+
+ALONE, SHARED = "one frame", "in a sequence"
+
+
+def run(settings: Settings) -> SuiteResult:
+    """Render the same frames of every model in all ways, in turn."""
+    rows = [row for name, parts in _models(settings) for row in _measure(name, parts, settings)]
+    return SuiteResult(
+        title="Milliseconds of a frame",
+        summary=(
+            "Frames of a split, spread evenly, rendered in evaluation mode, one after the other, and compared with the "
+            f"true pictures. `{ALONE}`: nothing is kept from frame to frame. `{SHARED}`: what frames share (canonical "
+            "space in bricks) is kept, as `render.py` does for long films, and was computed before the clock starts; "
+            "left out where haze forbids it. `splits`: parts of a step in which something is seen "
+            "(`sampler.render_splits`; the run's own comes first). All ways of a model are timed in turn."
+        ),
+        tables=[Table("Frames", rows, "PSNR in dB, mean over the frames; medians and quartiles of their mean time.")],
+        plots=[_plot(rows)],
+        findings=_findings(rows),
+    )
+
+
+def _models(settings: Settings) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Finished runs by name, or a model that is trained now if there are none."""
+    options = settings.options
+    for folder in options["runs"]:
+        yield Path(folder).name, settings.finished(folder)
+    if not options["runs"]:
+        parts = settings.parts(
+            f"experiment={options['experiment']}",
+            *scene_overrides(
+                options["scene"], 48 if settings.quick else options["resolution"], options["data_root"], settings.quick
+            ),
+            f"trainer.max_seconds={5 if settings.quick else options['train_seconds']}", "trainer.progress_bar=false",
+        )  # fmt: skip
+        parts["renderer"].to(settings.device)
+        parts["trainer"].fit(parts["renderer"], parts["data"].frames("train"), seed=settings.seed)
+        yield options["scene"], parts
+
+
+def _measure(name: str, parts: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]]:
+    options = settings.options
+    renderer: Renderer = parts["renderer"].to(settings.device).eval()
+    frames: Frames = parts["data"].frames(options["split"]).to(settings.device)
+    count = min(1 if settings.quick else options["num_frames"], len(frames))
+    chosen = torch.linspace(0, len(frames) - 1, count).round().long().tolist()
+    background = renderer.background(torch.zeros(1, 3, device=settings.device))[0]
+    truths = [frames.image(i, background.to(frames.image(i).device)) for i in chosen]
+    ways = dict(_ways(renderer, [] if settings.quick else options["splits"]))
+
+    def pictures(model: Renderer) -> list[Tensor]:
+        return [model.render_image(frames.camera(i), float(frames.times[i]), chunk=parts["chunk"]).rgb for i in chosen]
+
+    scores = {}
+    for way, model in ways.items():
+        shown = zip(pictures(model), truths, strict=True)
+        scores[way] = sum(psnr(picture.clamp(0, 1), truth.to(picture)) for picture, truth in shown) / count
+    timings = time_in_turn(
+        {str(way): partial(pictures, model) for way, model in ways.items()},
+        seconds=0.1, min_repeats=1 if settings.quick else options["repeats"], device=settings.device,
+    )  # fmt: skip
+    size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
+    return [
+        {
+            "run": name,
+            "size": size,
+            "shown": way[0],
+            "splits": way[1],
+            "psnr": float(scores[way]),
+            **{column: value / count for column, value in timings[str(way)].milliseconds.items()},
+            "frames_per_second": count / timings[str(way)].median,
+        }
+        for way in ways
+    ]
+
+
+def _ways(renderer: Renderer, splits: list[int]) -> Iterator[tuple[tuple[str, int | None], Renderer]]:
+    """The model's ways to show a frame: alone and sharing, with its own parts of a step and with others."""
+    shared = renderer.for_sequence(FRAMES_THAT_SHARE)
+    own = renderer.sampler.render_splits if isinstance(renderer.sampler, OccupancySampler) else None
+    others = [] if own is None else [value for value in splits if value != own]
+    for shown, model in ((ALONE, renderer),) if shared is renderer else ((ALONE, renderer), (SHARED, shared)):
+        for value in (own, *others):
+            sampler = copy.deepcopy(renderer.sampler)
+            if isinstance(sampler, OccupancySampler) and value is not None:
+                sampler.render_splits = value
+            changed = Renderer(
+                model.field, sampler, renderer.background,
+                precision=renderer.precision, stop_transmittance=renderer.stop_transmittance,
+                quadrature=renderer.quadrature,
+            )  # fmt: skip
+            yield (shown, value), changed.eval()
+
+
+def _plot(rows: list[dict[str, Any]]) -> Plot:
+    series = []
+    for name, shown in dict.fromkeys((row["run"], row["shown"]) for row in rows):
+        part = [row for row in rows if (row["run"], row["shown"]) == (name, shown)]
+        part.sort(key=lambda row: row["splits"] or 0)
+        x, low, high = ([row[column] for row in part] for column in ("median_ms", "low_ms", "high_ms"))
+        notes = ["" if row["splits"] is None else str(row["splits"]) for row in part]
+        y = [row["psnr"] for row in part]
+        series.append(Series(f"{name}, {shown}", x, y, x_low=low, x_high=high, notes=notes))
+    return Plot(
+        name="frames",
+        title="Quality against time of a frame",
+        x_label="time per frame (ms)",
+        y_label="PSNR (dB)",
+        series=series,
+        y_log=False,
+        note="Up and left is better; numbers are the parts of a step, bars the quartiles of time.",
+    )
+
+
+def _findings(rows: list[dict[str, Any]]) -> list[str]:
+    """What every run's own settings take: the first row of each way to show it."""
+    own: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        own.setdefault((row["run"], row["shown"]), row)
+    return [
+        f"{name}, {row['size']}, {shown}: {row['median_ms']:.0f} ms [{row['low_ms']:.0f}, {row['high_ms']:.0f}], "
+        f"{row['psnr']:.2f} dB."
+        for (name, shown), row in own.items()
+    ]
