@@ -63,7 +63,7 @@ def _measure(name: str, parts: Mapping[str, Any], settings: Settings) -> list[di
     count = min(1 if settings.quick else options["num_frames"], len(frames))
     chosen = torch.linspace(0, len(frames) - 1, count).round().long().tolist()
     background = renderer.background(torch.zeros(1, 3, device=settings.device))[0]
-    truths = [frames.image(i, background.to(frames.image(i).device)) for i in chosen]
+    truths = [frames.image(i, background) for i in chosen]
     ways = dict(_ways(renderer, [] if settings.quick else options["splits"]))
 
     def pictures(model: Renderer) -> list[Tensor]:
@@ -72,7 +72,7 @@ def _measure(name: str, parts: Mapping[str, Any], settings: Settings) -> list[di
     scores = {}
     for way, model in ways.items():
         shown = zip(pictures(model), truths, strict=True)
-        scores[way] = sum(psnr(picture.clamp(0, 1), truth.to(picture)) for picture, truth in shown) / count
+        scores[way] = sum(psnr(picture.clamp(0, 1), truth) for picture, truth in shown) / count
     timings = time_in_turn(
         {str(way): partial(pictures, model) for way, model in ways.items()},
         seconds=0.1, min_repeats=1 if settings.quick else options["repeats"], device=settings.device,
