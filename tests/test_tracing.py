@@ -53,6 +53,20 @@ def picture(renderer: Renderer, time: float = 0.3) -> Tensor:
     return torch.cat([shown.rgb, shown.opacity[..., None], shown.depth[..., None]], dim=-1)
 
 
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many vertices were asked for, each time that a lattice was filled."""
+    counts: list[int] = []
+    fill = FrozenDeformation.fill
+
+    def counted(self: FrozenDeformation, wanted: Tensor) -> bool:
+        counts.append(int(wanted.sum()))
+        return fill(self, wanted)
+
+    monkeypatch.setattr(FrozenDeformation, "fill", counted)
+    return counts
+
+
 @pytest.mark.parametrize("time_terms", [1, 3])
 @pytest.mark.parametrize("splits", [1, 3])
 def test_it_shows_what_the_chain_shows(time_terms: int, splits: int) -> None:
@@ -77,15 +91,9 @@ def test_it_shows_what_the_chain_shows(time_terms: int, splits: int) -> None:
     torch.testing.assert_close(shown, expected, rtol=0, atol=1e-3)
 
 
-def test_what_is_filled_ahead_is_most_of_it_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-    fill = FrozenDeformation.fill
-
-    def counted(self: FrozenDeformation, wanted: Tensor) -> bool:
-        asked.append(int(wanted.sum()))
-        return fill(self, wanted)
-
-    monkeypatch.setattr(FrozenDeformation, "fill", counted)
+def test_what_is_filled_ahead_is_most_of_it_and_changes_nothing(
+    asked: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("dnerf.tracing.VERTICES_PER_RAY", 100)  # all around occupied cells
     ahead = picture(model(splits=3))
     assert asked[0] > 0.9 * sum(asked)
@@ -95,16 +103,8 @@ def test_what_is_filled_ahead_is_most_of_it_and_changes_nothing(monkeypatch: pyt
     assert asked[0] < 0.9 * sum(asked)
 
 
-def test_frames_do_not_depend_on_those_before(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_do_not_depend_on_those_before(asked: list[int]) -> None:
     """Which vertices are asked together depends on a frame alone: other numbers of rows may round otherwise."""
-    asked: list[int] = []
-    fill = FrozenDeformation.fill
-
-    def counted(self: FrozenDeformation, wanted: Tensor) -> bool:
-        asked.append(int(wanted.sum()))
-        return fill(self, wanted)
-
-    monkeypatch.setattr(FrozenDeformation, "fill", counted)
     renderer = model()
     alone = picture(model(), 0.8)
     sizes = asked.copy()

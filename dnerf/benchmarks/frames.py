@@ -1,6 +1,5 @@
 """What a frame of a finished model takes, alone and in a sequence, and how near it comes to the truth."""
 
-import copy
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -9,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dnerf.benchmarks.scenes import scene_overrides
+from dnerf.benchmarks.scenes import train_model
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import time_in_turn
 from dnerf.data.frames import Frames
+from dnerf.evaluation import spread_indices
 from dnerf.metrics import psnr
 from dnerf.renderer import FRAMES_THAT_SHARE, Renderer
 from dnerf.samplers import OccupancySampler
@@ -44,37 +44,27 @@ def _models(settings: Settings) -> Iterator[tuple[str, Mapping[str, Any]]]:
     for folder in options["runs"]:
         yield Path(folder).name, settings.finished(folder)
     if not options["runs"]:
-        parts = settings.parts(
-            f"experiment={options['experiment']}",
-            *scene_overrides(
-                options["scene"], 48 if settings.quick else options["resolution"], options["data_root"], settings.quick
-            ),
-            f"trainer.max_seconds={5 if settings.quick else options['train_seconds']}", "trainer.progress_bar=false",
-        )  # fmt: skip
-        parts["renderer"].to(settings.device)
-        parts["trainer"].fit(parts["renderer"], parts["data"].frames("train"), seed=settings.seed)
-        yield options["scene"], parts
+        yield options["scene"], train_model(settings)
 
 
 def _measure(name: str, parts: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]]:
     options = settings.options
     renderer: Renderer = parts["renderer"].to(settings.device).eval()
     frames: Frames = parts["data"].frames(options["split"]).to(settings.device)
-    count = min(1 if settings.quick else options["num_frames"], len(frames))
-    chosen = torch.linspace(0, len(frames) - 1, count).round().long().tolist()
+    chosen = spread_indices(len(frames), 1 if settings.quick else options["num_frames"])
+    count = len(chosen)
     background = renderer.background(torch.zeros(1, 3, device=settings.device))[0]
     truths = [frames.image(i, background) for i in chosen]
-    ways = dict(_ways(renderer, [] if settings.quick else options["splits"]))
-
-    def pictures(model: Renderer) -> list[Tensor]:
-        return [model.render_image(frames.camera(i), float(frames.times[i]), chunk=parts["chunk"]).rgb for i in chosen]
-
-    scores = {}
-    for way, model in ways.items():
-        shown = zip(pictures(model), truths, strict=True)
-        scores[way] = sum(psnr(picture.clamp(0, 1), truth) for picture, truth in shown) / count
+    calls = {
+        way: partial(_pictures, model, way[1], frames, chosen, parts["chunk"])
+        for way, model in _ways(renderer, [] if settings.quick else options["splits"])
+    }
+    scores = {
+        way: sum(psnr(picture.clamp(0, 1), truth) for picture, truth in zip(call(), truths, strict=True)) / count
+        for way, call in calls.items()
+    }
     timings = time_in_turn(
-        {str(way): partial(pictures, model) for way, model in ways.items()},
+        {str(way): call for way, call in calls.items()},
         seconds=0.1, min_repeats=1 if settings.quick else options["repeats"], device=settings.device,
     )  # fmt: skip
     size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
@@ -88,7 +78,7 @@ def _measure(name: str, parts: Mapping[str, Any], settings: Settings) -> list[di
             **{column: value / count for column, value in timings[str(way)].milliseconds.items()},
             "frames_per_second": count / timings[str(way)].median,
         }
-        for way in ways
+        for way in calls
     ]
 
 
@@ -99,15 +89,13 @@ def _ways(renderer: Renderer, splits: list[int]) -> Iterator[tuple[tuple[str, in
     others = [] if own is None else [value for value in splits if value != own]
     for shown, model in ((ALONE, renderer),) if shared is renderer else ((ALONE, renderer), (SHARED, shared)):
         for value in (own, *others):
-            sampler = copy.deepcopy(renderer.sampler)
-            if isinstance(sampler, OccupancySampler) and value is not None:
-                sampler.render_splits = value
-            changed = Renderer(
-                model.field, sampler, renderer.background,
-                precision=renderer.precision, stop_transmittance=renderer.stop_transmittance,
-                quadrature=renderer.quadrature,
-            )  # fmt: skip
-            yield (shown, value), changed.eval()
+            yield (shown, value), model
+
+
+def _pictures(renderer: Renderer, splits: int | None, frames: Frames, chosen: list[int], chunk: int) -> list[Tensor]:
+    if isinstance(renderer.sampler, OccupancySampler) and splits is not None:
+        renderer.sampler.render_splits = splits  # of all ways: they share a sampler
+    return [renderer.render_image(frames.camera(i), float(frames.times[i]), chunk=chunk).rgb for i in chosen]
 
 
 def _plot(rows: list[dict[str, Any]]) -> Plot:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dnerf.benchmarks.scenes import scene_overrides
+from dnerf.benchmarks.scenes import train_model
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import time_in_turn
 from dnerf.data.frames import Frames
@@ -49,14 +49,8 @@ class Setting(NamedTuple):
 def run(settings: Settings) -> SuiteResult:
     """Train a model, then render a few frames with every setting; the reference leaves out nothing."""
     options = settings.options
-    resolution = 48 if settings.quick else options["resolution"]
-    parts = settings.parts(
-        f"experiment={options['experiment']}",
-        *scene_overrides(options["scene"], resolution, options["data_root"], settings.quick),
-        f"trainer.max_seconds={5 if settings.quick else options['train_seconds']}", "trainer.progress_bar=false",
-    )  # fmt: skip
-    renderer, frames = parts["renderer"].to(settings.device), parts["data"].frames("test").to(settings.device)
-    parts["trainer"].fit(renderer, parts["data"].frames("train"), seed=settings.seed)
+    parts = train_model(settings)
+    renderer, frames = parts["renderer"], parts["data"].frames("test").to(settings.device)
     trained = renderer.sampler
     if not isinstance(trained, OccupancySampler):
         raise ValueError(f"pruning.experiment must sample by occupancy, got {type(trained).__name__}")
@@ -72,8 +66,9 @@ def run(settings: Settings) -> SuiteResult:
     return SuiteResult(
         title="Pruning: error introduced against time saved",
         summary=(
-            f"`experiment={options['experiment']}` trained on `{options['scene']}`; two test frames of {resolution} x "
-            f"{resolution} pixels rendered in evaluation mode with every setting of one knob at a time. Occupancy "
+            f"`experiment={options['experiment']}` trained on `{options['scene']}`; two test frames of "
+            f"{frames.intrinsics.width} x {frames.intrinsics.height} pixels rendered in evaluation mode with every "
+            "setting of one knob at a time. Occupancy "
             "grids are filled from the finished field (`OccupancySampler.fill`, random probes of every cell), so that "
             "their error is what a setting loses; `as trained` is the grid that training left behind, without its "
             "margin in space if the experiment renders so; `the experiment's own` adds its cut-off and the lattice of "

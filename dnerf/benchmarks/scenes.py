@@ -1,7 +1,10 @@
 """Scenes that benchmarks train on: exact ones by name, real ones as folders."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from dnerf.benchmarks.suite import Settings
 from dnerf.scenes import SCENES
 
 
@@ -27,3 +30,19 @@ def scene_overrides(scene: str, resolution: int, data_root: str | None, quick: b
             f"got {scene!r} and data_root={data_root!r}"
         )
     return ["data=blender", f"data.root={folder}", f"data.resolution={resolution}"]
+
+
+def train_model(settings: Settings) -> Mapping[str, Any]:
+    """Parts (`Settings.parts`) of the model that a suite's section of the config describes, trained.
+
+    Its options are `experiment`, `scene`, `resolution`, `data_root` and `train_seconds`.
+    """
+    options, quick = settings.options, settings.quick
+    parts = settings.parts(
+        f"experiment={options['experiment']}",
+        *scene_overrides(options["scene"], 48 if quick else options["resolution"], options["data_root"], quick),
+        f"trainer.max_seconds={5 if quick else options['train_seconds']}", "trainer.progress_bar=false",
+    )  # fmt: skip
+    parts["renderer"].to(settings.device)
+    parts["trainer"].fit(parts["renderer"], parts["data"].frames("train"), seed=settings.seed)
+    return parts
