@@ -55,12 +55,17 @@ class SinusoidalEncoding(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         """Encode (..., D) -> (..., D * (2 * num_frequencies + include_input)), in the input's dtype."""
+        return torch.cat(self.parts(values), dim=-1)
+
+    def parts(self, values: Tensor) -> list[Tensor]:
+        """What `forward` puts together, for callers who put more together in one go."""
         check_last_axis("values", values, self.num_dims)
         angles = (values[..., None, :] * self.frequencies.to(values.dtype)[:, None]).flatten(-2)
-        waves = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1)
+        waves = [torch.sin(angles), torch.cos(angles)]
         if self.window_end is not None:
-            waves = waves * self.window.to(values.dtype).repeat_interleave(self.num_dims).repeat(2)
-        return torch.cat([values, waves], dim=-1) if self.include_input else waves
+            window = self.window.to(values.dtype).repeat_interleave(self.num_dims)
+            waves = [wave * window for wave in waves]
+        return [values, *waves] if self.include_input else waves
 
 
 class SphericalHarmonicsEncoding(nn.Module):

@@ -86,7 +86,7 @@ class HiddenMatterLoss(Loss):
 
     A field invents matter where no training ray reaches (below the ground, inside bodies), and views from elsewhere
     show it. What rays see is left alone: a cell of canonical space in which a sample had a share in a picture within
-    the last `memory` steps costs nothing. Inside opaque matter there is no gradient, `1 - exp(-density length)` is
+    the last `memory` calls costs nothing. Inside opaque matter there is no gradient, `1 - exp(-density length)` is
     flat there; none reaches the deformation.
 
     Without effect for samplers that do not know where matter is, see `Sampler.places`.
@@ -100,7 +100,7 @@ class HiddenMatterLoss(Loss):
         num_points: places of each step.
         length: of the intervals, in world units.
         resolution: cells along each side of the box.
-        memory: steps after which a cell that had no share in a picture counts as hidden.
+        memory: calls after which a cell that had no share in a picture counts as hidden.
 
     Raises:
         ValueError: for numbers that are not positive, or a negative weight; when used, for a field that is not

@@ -1,11 +1,13 @@
 """The multi-layer perceptron that fields and deformations share."""
 
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
 from dnerf.checks import check_choice, check_positive
+from dnerf.kernels import relu_layers
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "relu": torch.relu_,
@@ -70,6 +72,10 @@ class MLP(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Map (..., in_features) -> (..., out_features)."""
         x = inputs
-        for i, layer in enumerate(self.hidden):
-            x = self.activation(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
+        if self.hidden and not self.skips and self.activation is torch.relu_:
+            layers = [cast(nn.Linear, layer) for layer in self.hidden]
+            x = relu_layers(inputs, [layer.weight for layer in layers], [layer.bias for layer in layers])
+        else:
+            for i, layer in enumerate(self.hidden):
+                x = self.activation(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
         return x if self.output is None else self.output(x)

@@ -21,7 +21,7 @@ class TrainingRecord:
     Args:
         step: number of steps done, this one included.
         seconds: time spent training so far, callbacks and data loading left out.
-        losses: each loss term by name; "loss" is their sum.
+        losses: each loss term of the step by name; "loss" is what it minimised, see `Trainer`'s `loss_every`.
         psnr: of the batch's colours, in dB.
         num_rays: rays of the batch.
         num_samples: field evaluations of the batch.

@@ -22,7 +22,7 @@ from dnerf.tracing import FrameTracer
 logger = logging.getLogger(__name__)
 
 PAD_TO = 2048  # samples; see `Samples.padded`
-MOST_AT_ONCE = 1 << 18  # samples of a picture that the field is asked in one go: bounds the memory, in haze
+MOST_AT_ONCE = 1 << 17  # samples of a picture that the field is asked in one go: bounds the memory, in haze
 FRAMES_THAT_SHARE = 16  # from so many on a sequence has gained what keeping things between its frames costs
 MOST_TO_SHARE = 0.1  # of space, in which samples fall: haze is dearer to keep than to ask
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}

@@ -7,11 +7,12 @@ from contextlib import nullcontext
 from signal import Signals
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
 from dnerf.checks import check_choice, check_positive
+from dnerf.compositing import Rendering
 from dnerf.data.frames import Frames, composite_on
 from dnerf.distributed import Processes
 from dnerf.losses import Loss, PhotometricLoss
@@ -51,6 +52,8 @@ class Trainer:
         orthogonal: parameter-name prefixes of the renderer below which the weight matrices of networks (those of 16
             rows and columns or more) take orthogonalised steps, see `AdamMuon`.
         losses: terms by name; the photometric loss if None.
+        loss_every: by name of a term, n: it is asked on every n-th step and counts n times there, which costs less and
+            means the same on average; names that are none are ignored, others take part in every step.
         time_window: lets frames in by time as training goes on; None for all from the start.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
@@ -77,6 +80,7 @@ class Trainer:
         epsilon: float = 1e-8,
         orthogonal: Sequence[str] = (),
         losses: Mapping[str, Loss] | None = None,
+        loss_every: Mapping[str, int] | None = None,
         time_window: TimeWindow | None = None,
         log_every: int = 20,
         checkpoint_every: int | None = 1000,
@@ -92,6 +96,7 @@ class Trainer:
             ("checkpoint_every", 1 if checkpoint_every is None else checkpoint_every),
             ("max_seconds", 1 if max_seconds is None else max_seconds),
             ("target_samples", 1 if target_samples is None else target_samples),
+            *((f"loss_every.{name}", every) for name, every in (loss_every or {}).items()),
         ):
             check_positive(name, value)
         check_choice("schedule", schedule, SCHEDULES)
@@ -110,6 +115,7 @@ class Trainer:
         self.epsilon = epsilon
         self.orthogonal = tuple(orthogonal)
         self.losses = nn.ModuleDict({"rgb": PhotometricLoss()} if losses is None else dict(losses))
+        self.loss_every = dict(loss_every or {})
         self.time_window = time_window
         self.log_every = log_every
         self.checkpoint_every = checkpoint_every
@@ -268,8 +274,7 @@ class Trainer:
         assert rendering.background is not None
         assert rendering.samples is not None
         target = composite_on(rgba, rendering.background)
-        terms = {name: loss(rendering, target, renderer) for name, loss in self.losses.items()}
-        total = torch.stack(list(terms.values())).sum()
+        terms, total = self._terms(run.step + 1, rendering, target, renderer)
         run.optimizer.zero_grad(set_to_none=True)
         # Shares may differ by a ray: weighted so, their mean is that over all rays.
         weight = len(rays) * processes.size / num_rays
@@ -280,6 +285,18 @@ class Trainer:
         shown = {} if self.recovery is None else what_is_shown(rendering, target)
         detached = {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse, **shown}.items()}
         return Outcome(detached, weight, rendering.samples.starts.numel(), factor)
+
+    def _terms(
+        self, number: int, rendering: Rendering, target: Tensor, renderer: Renderer
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """The terms whose turn a step is, by name, and what it minimises; steps are counted from 1."""
+        terms, total = {}, rendering.rgb.new_zeros(())
+        for name, loss in self.losses.items():
+            every = self.loss_every.get(name, 1)
+            if number % every == 0:
+                terms[name] = loss(rendering, target, renderer)
+                total = total + every * terms[name]
+        return terms, total
 
     def _next_num_rays(self, num_rays: int, num_samples: int) -> int:
         if self.target_samples is None:

@@ -9,13 +9,12 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "dnerf"
 
 FLOORS = {
-    # 0: knows nothing of rendering. `checks`, `files` and `mlp` serve every floor and need none.
+    # 0: knows nothing of rendering. `checks` and `files` serve every floor and need none.
     "allocator": 0,
     "checks": 0,
     "encodings": 0,
     "files": 0,
     "geometry": 0,
-    "mlp": 0,
     "provenance": 0,
     "rays": 0,
     "sparse": 0,
@@ -25,6 +24,7 @@ FLOORS = {
     "cameras": 1,
     "compositing": 1,
     "kernels": 1,
+    "mlp": 1,
     "quadrature": 1,
     "deformations": 2,
     "fields": 3,
@@ -73,7 +73,7 @@ WITHIN_A_FLOOR = {
     ("logs", "evaluation"),
     ("logs", "training"),
     ("logs", "video"),
-    ("mlp", "checks"),
+    ("mlp", "kernels"),
     ("motion_losses", "losses"),
     ("tracks", "video"),
     ("rays", "checks"),

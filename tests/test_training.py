@@ -147,3 +147,32 @@ def test_losses_add_up_and_are_logged_by_name(frames):
     assert terms.keys() == {"loss", "rgb", "haze"}
     assert math.isclose(terms["loss"], terms["rgb"] + terms["haze"], rel_tol=1e-5)
     assert terms["haze"] > 0
+
+
+def test_a_loss_that_takes_turns_counts_as_often(frames):
+    records = []
+    trainer(
+        num_steps=6,
+        log_every=1,
+        losses={"rgb": PhotometricLoss(), "haze": OpacityEntropyLoss(0.1)},
+        loss_every={"haze": 3, "another": 2},
+    ).fit(small_renderer(), frames, callbacks=[lambda r, _: records.append(r)])
+    assert [r.step for r in records if "haze" in r.losses] == [3, 6]
+    for record in records:
+        terms = record.losses
+        assert math.isclose(terms["loss"], terms["rgb"] + 3 * terms.get("haze", 0), rel_tol=1e-5)
+
+
+def test_a_step_without_any_loss_changes_nothing(frames):
+    renderer, seen = small_renderer(), []
+    before = weights(renderer)
+    trainer(num_steps=2, log_every=1, losses={"rgb": PhotometricLoss()}, loss_every={"rgb": 2}).fit(
+        renderer, frames, callbacks=[lambda r, model: seen.append(torch.equal(weights(model), before))]
+    )
+    assert seen == [True, False]
+
+
+@pytest.mark.parametrize("every", [0, -1])
+def test_turns_must_be_positive(every):
+    with pytest.raises(ValueError, match=r"loss_every\.haze must be > 0"):
+        trainer(loss_every={"haze": every})

@@ -59,7 +59,9 @@ class DisplacementDeformation(Deformation):
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Canonical positions (..., 3) of world positions (..., 3) at times (...,)."""
         check_positions_times(positions, times)
-        encoded = torch.cat([self.encode_positions(positions), self.encode_times(times[..., None])], dim=-1)
+        encoded = torch.cat(
+            [*self.encode_positions.parts(positions), *self.encode_times.parts(times[..., None])], dim=-1
+        )
         offsets = self.mlp(encoded).to(positions.dtype)
         if self.canonical_time is not None:
             offsets = offsets * (times[..., None] - self.canonical_time)

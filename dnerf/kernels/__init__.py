@@ -6,6 +6,7 @@ from .grid_encode import GridLevels, grid_encode
 from .march import MarchedSamples, MarchGrid, march
 from .packed_sum import packed_sum
 from .packed_weights import packed_weights
+from .relu_layers import relu_layers
 from .skip_distances import skip_distances
 from .trace import FrameTables, trace
 
@@ -21,6 +22,7 @@ __all__ = [
     "march",
     "packed_sum",
     "packed_weights",
+    "relu_layers",
     "set_backend",
     "skip_distances",
     "trace",

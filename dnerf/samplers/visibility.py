@@ -22,7 +22,7 @@ def walk_front_to_back(
     visit: Visitor,
     *,
     first_round: int = 8,
-    most_at_once: int = 1 << 20,
+    most_at_once: int = 1 << 18,
 ) -> None:
     """Visit the samples of rays in rounds: the first few of each, twice as many, and so on, until it is opaque.
 
@@ -96,7 +96,7 @@ def visible_weights(
     min_weight: float,
     *,
     first_round: int = 8,
-    most_at_once: int = 1 << 20,
+    most_at_once: int = 1 << 18,
     pad_to: int = 1,
     observe: Observer | None = None,
 ) -> Tensor:

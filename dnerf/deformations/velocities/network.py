@@ -3,19 +3,20 @@
 import math
 from collections.abc import Callable, Sequence
 
+import torch
 from torch import Tensor, nn
 
 from dnerf.checks import check_positive
 from dnerf.deformations.velocities.base import BoxWindow, Velocity
 from dnerf.encodings import SinusoidalEncoding
+from dnerf.kernels import relu_layers
 from dnerf.mlp import ACTIVATIONS, MLP
 
 
 class NetworkVelocity(Velocity):
     """v(x, t) = w(x) MLP(x, t), w the window of the box; zero everywhere at initialisation.
 
-    The first layer is linear in the encodings of position and of time apart, so the part of time is worked out once
-    where a solver looks several times at the same times (`at`).
+    Where a solver looks several times at the same times (`at`), those are encoded once.
 
     Args:
         box: (2, 3) corners outside of which nothing moves, in world units.
@@ -72,12 +73,17 @@ class NetworkVelocity(Velocity):
         return self.at(times)(positions)
 
     def at(self, times: Tensor) -> Callable[[Tensor], Tensor]:
-        """The field at fixed times, their part of the first layer worked out once."""
-        of_times = self.from_times(self.encode_times(times[..., None]))
+        """The field at fixed times."""
+        of_times = self.encode_times(times[..., None])
+        weight, bias = torch.cat([self.from_positions.weight, self.from_times.weight], dim=-1), self.from_times.bias
 
         def velocity(positions: Tensor) -> Tensor:
             inside = self.window.inside(positions)
-            hidden = self.activation(self.from_positions(self.encode_positions(inside)) + of_times)
+            inputs = torch.cat([*self.encode_positions.parts(inside), of_times], dim=-1)
+            if self.activation is torch.relu_:
+                hidden = relu_layers(inputs, [weight], [bias])
+            else:
+                hidden = self.activation(nn.functional.linear(inputs, weight, bias))
             return self.window(positions) * self.mlp(hidden).to(positions.dtype)
 
         return velocity

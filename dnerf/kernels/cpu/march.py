@@ -13,9 +13,13 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..skip_distances import BLOCK_BITS
-from .launch import BORROWS, launch
+from .launch import BORROWS, launch, num_threads
 from .rows import trailing_zeros
 from .skip_distances import skip_distances
+
+TESTED_AT_ONCE = 32  # intervals of a ray, by vector instructions; few rays want fewer
+RAYS_AT_ONCE = 64  # neighbours, dealt out to threads in turn: matter fills the middle of a picture
+LINE = 32  # numbers between what two workers write, so that they share no line of a cache
 
 
 def march(
@@ -48,8 +52,9 @@ def march(
     reach = skips.contiguous().numpy()
     bounds = np.empty((len(grid), 3, 2), np.int64)
     launch(block_bounds, reach, bounds)
-    arguments = (o, d, t0, times_, jitter_, grid, reach, bounds, box, size, limit, ranges, counts)
-    launch(_mark, *arguments, kept, offsets.numpy())
+    slabs = grid.reshape(len(grid), -1)
+    arguments = (o, d, t0, times_, jitter_, slabs, grid.shape[1:], reach, bounds, box, size, limit, ranges, counts)
+    launch(_mark, *arguments, kept, offsets.numpy(), cells_of_workers(num_threads()))
     torch.cumsum(offsets, 0, out=offsets)
 
     num_samples = int(offsets[-1])
@@ -58,6 +63,11 @@ def march(
     arrays = (starts.numpy(), ends.numpy(), ray_indices.numpy())
     launch(_fill, t0, jitter_, size, ranges, kept, offsets.numpy(), *arrays)
     return starts, ends, ray_indices, offsets
+
+
+def cells_of_workers(num_workers: int) -> np.ndarray:
+    """Each one's scratch for `next_kept`."""
+    return np.empty((num_workers, TESTED_AT_ONCE + LINE), np.int32)
 
 
 # No fast-math in this file: intervals and cells must round like those of the definition.
@@ -94,7 +104,7 @@ def ray_ranges(
         counts[r] = math.ceil(length / step) + 3 if hit else 0
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
 def _interval(near: Any, jitter: Any, step: Any, enter: Any, leave: Any, index: Any) -> Any:
     one = type(near)(1)
     start = near + (index - one + jitter) * step
@@ -140,6 +150,7 @@ def _mark(
     times: Any,
     jitter: Any,
     occupancy: Any,
+    shape: Any,
     skips: Any,
     bounds: Any,
     aabb: Any,
@@ -149,6 +160,7 @@ def _mark(
     counts: Any,
     kept: Any,
     offsets: Any,
+    cells: Any,
 ) -> None:
     """Set a bit for every kept interval, and count them.
 
@@ -157,29 +169,27 @@ def _mark(
     Midpoints round monotonically, and so do the cells computed from them; the margins exceed the rounding of the
     distance to where the empty blocks end. So the result is that of testing every interval.
     """
-    for r in prange(len(near)):
-        slab = min(max(int(times[r] * near.dtype.type(occupancy.shape[0])), 0), occupancy.shape[0] - 1)
-        j, count, course = course_of(
-            origins[r],
-            directions[r],
-            near[r],
-            jitter[r],
-            step,
-            ranges[r],
-            counts[r],
-            occupancy[slab],
-            bounds[slab],
-            aabb,
-        )
-        found = 0
-        while found < limit:
-            j, _, _ = next_kept(j, count, course, occupancy[slab], skips[slab])
-            if j >= count:
-                break
-            kept[r, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
-            found += 1
-            j += 1
-        offsets[r + 1] = found
+    num_workers = len(cells)
+    num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
+    for worker in prange(num_workers):
+        for group in range(worker, num_groups, num_workers):
+            for r in range(group * RAYS_AT_ONCE, min((group + 1) * RAYS_AT_ONCE, len(near))):
+                slab = min(max(int(times[r] * near.dtype.type(occupancy.shape[0])), 0), occupancy.shape[0] - 1)
+                j, count, course = course_of(
+                    origins[r], directions[r], near[r], jitter[r], step, ranges[r], counts[r], shape, bounds[slab], aabb
+                )  # fmt: skip
+                found = 0
+                while found < limit:
+                    j, bits = next_kept(j, count, course, occupancy[slab], skips[slab], cells[worker])
+                    if bits == 0:
+                        break
+                    while bits and found < limit:
+                        k = j + int(trailing_zeros(bits))
+                        kept[r, k >> 6] |= np.uint64(1) << np.uint64(k & 63)
+                        bits &= bits - np.uint64(1)
+                        found += 1
+                    j += TESTED_AT_ONCE
+                offsets[r + 1] = found
 
 
 @njit(**BORROWS)
@@ -191,7 +201,7 @@ def course_of(
     step: Any,
     span: Any,
     count: Any,
-    occupancy: Any,
+    shape: Any,
     bounds: Any,
     aabb: Any,
 ) -> Any:
@@ -202,13 +212,13 @@ def course_of(
         step: length of an interval.
         span: entry, exit and number of the first interval, see `ray_ranges`.
         count: how many intervals there may be.
-        occupancy: (Gx, Gy, Gz), the ray's slab.
+        shape: Gx, Gy, Gz of the grid.
         bounds: (3, 2), the slab's, see `block_bounds`.
         aabb: (2, 3) box of the grid.
     """
     dtype = type(near)
     rounding = dtype(8) * dtype(np.finfo(dtype).eps)
-    nx, ny, nz = occupancy.shape
+    nx, ny, nz = shape
     enter, leave, first = span
     ox, oy, oz = origin
     dx, dy, dz = direction
@@ -226,6 +236,7 @@ def course_of(
         (scale_x, scale_y, scale_z),
         (margin_x, margin_y, margin_z),
         (near, jitter, step, enter, leave, first, slack),
+        (nx, ny, nz),
     )
     begin, finish = enter, leave
     u, v, w = (ox - aabb[0, 0]) * scale_x, (oy - aabb[0, 1]) * scale_y, (oz - aabb[0, 2]) * scale_z
@@ -240,36 +251,88 @@ def course_of(
     return j, min(int(count), max(int((finish + slack - base) / step), 0) + 3), course
 
 
-@njit(**BORROWS)
-def next_kept(j: int, count: int, course: Any, occupancy: Any, skips: Any) -> Any:
-    """The first kept interval from number j on, and its ends; a number of at least `count` if there is none."""
-    origin, direction, low, scale, margin, along = course
+@njit(forceinline=True, **BORROWS)
+def next_kept(j: int, count: int, course: Any, occupancy: Any, skips: Any, cells: Any) -> Any:
+    """From interval j on, where some in a row hold the first kept one, and the bits of those kept; 0 if none is.
+
+    Args:
+        j: number of the interval to begin at.
+        count: of the one after the last.
+        course: of the ray, see `course_of`.
+        occupancy: (Gx Gy Gz,), the ray's slab.
+        skips: its `skip_distances`.
+        cells: (TESTED_AT_ONCE,) int32, scratch.
+
+    Returns:
+        The number of the first of `TESTED_AT_ONCE` intervals, and their bits, a uint64.
+    """
+    bits = np.uint64(0)
+    while j < count and bits == 0:
+        free = _jump(j, course, skips)
+        if free > 0:
+            j += free
+            continue
+        _locate(j, course, cells)
+        for k in range(min(TESTED_AT_ONCE, count - j)):
+            # Without a branch, which nothing could predict.
+            bits |= np.uint64((cells[k] >= 0) & occupancy[max(cells[k], 0)]) << np.uint64(k)
+        if bits == 0:
+            j += TESTED_AT_ONCE
+    return j, bits
+
+
+@njit(forceinline=True, **BORROWS)
+def ends_of(j: int, course: Any) -> Any:
+    """Where an interval begins and ends."""
+    near, jitter, step, enter, leave, first, _ = course[5]
+    return _interval(near, jitter, step, enter, leave, first + type(near)(j))
+
+
+@njit(forceinline=True, **BORROWS)
+def _locate(j: int, course: Any, cells: Any) -> None:
+    """The flat numbers of the cells in which the middles of intervals lie; -1 for intervals of no length."""
+    (ox, oy, oz), (dx, dy, dz), (lx, ly, lz), (sx, sy, sz), _, along, (nx, ny, nz) = course
+    near, jitter, step, enter, leave, first, _ = along
+    dtype = type(near)
+    # Plain selections on one type each: this loop becomes vector instructions.
+    wide, deep = np.int32(ny), np.int32(nz)
+    last_x, last_y, last_z = dtype(nx - 1), dtype(ny - 1), dtype(nz - 1)
+    zero, one, half = dtype(0), dtype(1), dtype(0.5)
+    for k in range(TESTED_AT_ONCE):
+        index = first + dtype(np.int32(j) + np.int32(k))
+        start, end = near + (index - one + jitter) * step, near + (index + jitter) * step
+        start, end = enter if enter > start else start, leave if leave < end else end
+        middle = (start + end) * half
+        u, v, w = (ox + dx * middle - lx) * sx, (oy + dy * middle - ly) * sy, (oz + dz * middle - lz) * sz
+        u, v, w = u if u > zero else zero, v if v > zero else zero, w if w > zero else zero
+        u, v, w = last_x if u > last_x else u, last_y if v > last_y else v, last_z if w > last_z else w
+        cell = (np.int32(u) * wide + np.int32(v)) * deep + np.int32(w)
+        cells[k] = cell if end > start else np.int32(-1)
+
+
+@njit(forceinline=True, **BORROWS)
+def _jump(j: int, course: Any, skips: Any) -> int:
+    """How many intervals from j on certainly lie in empty blocks; 0 in a block that is not empty."""
+    origin, direction, low, scale, margin, along, (nx, ny, nz) = course
     near, jitter, step, enter, leave, first, slack = along
     dtype = type(near)
     half = dtype(0.5)
-    nx, ny, nz = occupancy.shape
-    start, end = near, near
-    while j < count:
-        index = first + dtype(j)
-        start, end = _interval(near, jitter, step, enter, leave, index)
-        middle = (start + end) * half
-        u = (origin[0] + direction[0] * middle - low[0]) * scale[0]
-        v = (origin[1] + direction[1] * middle - low[1]) * scale[1]
-        w = (origin[2] + direction[2] * middle - low[2]) * scale[2]
-        x, y, z = min(max(int(u), 0), nx - 1), min(max(int(v), 0), ny - 1), min(max(int(w), 0), nz - 1)
-        radius = int(skips[x >> BLOCK_BITS, y >> BLOCK_BITS, z >> BLOCK_BITS])
-        if radius == 0:
-            if end > start and occupancy[x, y, z]:
-                break
-            j += 1
-        else:
-            free = leave - middle
-            free = min(free, _free(u, x, radius, direction[0] * scale[0], margin[0]))
-            free = min(free, _free(v, y, radius, direction[1] * scale[1], margin[1]))
-            free = min(free, _free(w, z, radius, direction[2] * scale[2], margin[2]))
-            edge = near + (index + jitter) * step
-            j += 1 + max(int((middle + free - slack - edge) / step + half), 0)
-    return j, start, end
+    index = first + dtype(j)
+    start, end = _interval(near, jitter, step, enter, leave, index)
+    middle = (start + end) * half
+    u = (origin[0] + direction[0] * middle - low[0]) * scale[0]
+    v = (origin[1] + direction[1] * middle - low[1]) * scale[1]
+    w = (origin[2] + direction[2] * middle - low[2]) * scale[2]
+    x, y, z = min(max(int(u), 0), nx - 1), min(max(int(v), 0), ny - 1), min(max(int(w), 0), nz - 1)
+    radius = int(skips[x >> BLOCK_BITS, y >> BLOCK_BITS, z >> BLOCK_BITS])
+    if radius == 0:
+        return 0
+    free = leave - middle
+    free = min(free, _free(u, x, radius, direction[0] * scale[0], margin[0]))
+    free = min(free, _free(v, y, radius, direction[1] * scale[1], margin[1]))
+    free = min(free, _free(w, z, radius, direction[2] * scale[2], margin[2]))
+    edge = near + (index + jitter) * step
+    return 1 + max(int((middle + free - slack - edge) / step + half), 0)
 
 
 @njit(**BORROWS)
@@ -278,7 +341,7 @@ def _margin(rounding: Any, o: Any, d: Any, lower: Any, scale: Any, leave: Any, s
     return rounding * (type(o)(size) + scale * (abs(o) + abs(lower) + abs(d) * abs(leave)))
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
 def _free(position: Any, cell: int, radius: int, speed: Any, margin: Any) -> Any:
     """Distance along the ray that surely stays, on one axis, within the blocks closer than `radius`."""
     dtype = type(position)

@@ -14,13 +14,21 @@ from ..trace import DONE, ELSEWHERE, LACKS_BRICK, LACKS_VERTEX, LOOK_AHEAD, MOST
 from .brick_lookup import SIDE, cell_of, corner_rows, corner_weights, first_row, is_inside
 from .grid_encode import locate, trilinear_weights
 from .launch import BORROWS, FAST, launch, num_threads
-from .march import block_bounds, course_of, next_kept, ray_ranges
-from .rows import blend_rows, prefetch_row
+from .march import (
+    LINE,
+    RAYS_AT_ONCE,
+    TESTED_AT_ONCE,
+    block_bounds,
+    cells_of_workers,
+    course_of,
+    ends_of,
+    next_kept,
+    ray_ranges,
+)  # fmt: skip
+from .rows import blend_rows, prefetch_row, trailing_zeros
 
-RAYS_AT_ONCE = 64  # neighbours, dealt out to threads in turn: matter fills the middle of a picture
 SAMPLES_AT_ONCE = 8  # of a ray: while one is waiting for memory, the others are
 FOUR = (0, 0, 0, 0)
-LINE = 32  # float32s between what two workers write, so that they share no line of a cache
 GOES_ON = 0  # between what ends a ray and what it may lack
 
 
@@ -45,21 +53,29 @@ def trace(
     launch(
         _trace,
         (o, d, t0, ranges, counts),
-        (occupancy.contiguous().numpy(), reach, bounds[0], box, size),
+        (occupancy.contiguous().view(-1).numpy(), tuple(occupancy.shape), reach, bounds[0], box, size),
         (table, known, low_, sides_),
         (
             slots_, bricks_.reshape(len(bricks) * VERTICES, bricks.shape[2]), brick_low_, np.float32(cells_per_unit),
             waves_, np.float32(log_shift),
         ),
-        (splits, np.float32(min_weight), np.float32(split_weight), np.float32(stop_transmittance)),
+        (
+            splits, np.float32(min_weight), np.float32(split_weight), np.float32(stop_transmittance),
+            np.float32(_faint(min_weight, step)),
+        ),
         states.numpy(),
         numbers.numpy(),
         vertices.numpy(),
         wanted.numpy(),
-        _scratch(num_threads(), max(SAMPLES_AT_ONCE, splits), bricks.shape[2]),
+        (*_scratch(num_threads(), max(SAMPLES_AT_ONCE, splits), bricks.shape[2]), cells_of_workers(num_threads())),
         (0,) * bricks.shape[2],
     )  # fmt: skip
     return states, numbers, vertices.view(-1), wanted
+
+
+def _faint(min_weight: float, step: float) -> float:
+    """The logarithm of a density of which no interval's weight exceeds `min_weight`, with room for rounding."""
+    return math.log(min_weight / step) - 1e-3 if min_weight > 0 else -math.inf
 
 
 def _scratch(num_workers: int, size: int, num_contents: int) -> tuple[np.ndarray, ...]:
@@ -90,26 +106,24 @@ def _trace(
 ) -> None:
     num_workers = len(scratch[0])
     origins, directions, near, ranges, counts = rays
-    occupancy, skips, bounds, aabb, step = grid
+    occupancy, shape, skips, bounds, aabb, step = grid
     splits = options[0]
     num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
     for worker in prange(num_workers):
         intervals = scratch[0][worker], scratch[1][worker, 0]
         found, parts = (scratch[1][worker, 1], scratch[2][worker, 0]), (scratch[1][worker, 2], scratch[2][worker, 1])
-        values, moved = scratch[3][worker], scratch[4][worker]
+        values, moved, cells = scratch[3][worker], scratch[4][worker], scratch[5][worker]
         for group in range(worker, num_groups, num_workers):
             for r in range(group * RAYS_AT_ONCE, min((group + 1) * RAYS_AT_ONCE, len(near))):
                 if numbers[r] < 0:
                     continue
                 j, count, course = course_of(
-                    origins[r], directions[r], near[r], np.float32(0), step, ranges[r], counts[r],
-                    occupancy, bounds, aabb,
+                    origins[r], directions[r], near[r], np.float32(0), step, ranges[r], counts[r], shape, bounds, aabb
                 )  # fmt: skip
-                j = max(j, numbers[r])
-                end = GOES_ON
+                j, bits, end = max(j, numbers[r]), np.uint64(0), GOES_ON
                 while end == GOES_ON:
-                    j, size, end = _gather(
-                        j, count, course, occupancy, skips, lattice, contents, intervals, found, moved
+                    j, bits, size, end = _gather(
+                        j, bits, count, course, occupancy, skips, lattice, contents, intervals, found, moved, cells
                     )
                     stopped, why = _composite(
                         size, intervals, found, parts, course, lattice, contents, options, states[r], values,
@@ -118,16 +132,17 @@ def _trace(
                     if why != GOES_ON:
                         j, end = stopped, why
                 if end == LACKS_VERTEX:
-                    _mark_ahead(j, count, course, occupancy, skips, lattice, splits, vertices)
+                    _mark_ahead(j, count, course, occupancy, skips, lattice, splits, vertices, cells)
                 if end == LACKS_BRICK:
-                    _, first, last = next_kept(j, count, course, occupancy, skips)
+                    first, last = ends_of(j, course)
                     _mark_brick(first, last, splits, course, lattice, contents, moved, wanted)
                 numbers[r] = j if end > GOES_ON else end
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
 def _gather(
     j: int,
+    bits: Any,
     count: int,
     course: Any,
     occupancy: Any,
@@ -137,22 +152,33 @@ def _gather(
     intervals: Any,
     found: Any,
     moved: Any,
+    cells: Any,
 ) -> Any:
-    """The next intervals of a ray, their contents on their way: its next one, how many, and why not more."""
+    """The next intervals of a ray, their contents on their way.
+
+    Returns:
+        Where the kept intervals go on, see `next_kept`; or if the ray does not, its next interval and no bits; how many
+        were found; and why not more.
+    """
     spans, numbers = intervals
     for i in range(SAMPLES_AT_ONCE):
-        j, start, end = next_kept(j, count, course, occupancy, skips)
-        if j >= count:
-            return j, i, DONE
+        if bits == 0:
+            j, bits = next_kept(j, count, course, occupancy, skips, cells)
+            if bits == 0:
+                return j, bits, i, DONE
+        number = j + int(trailing_zeros(bits))
+        start, end = ends_of(number, course)
         why = _find(np.float32(0.5) * (start + end), course, lattice, contents, found, i, moved)
         if why != GOES_ON:
-            return j, i, why
-        spans[i, 0], spans[i, 1], numbers[i] = start, end, j
-        j += 1
-    return j, SAMPLES_AT_ONCE, GOES_ON
+            return number, np.uint64(0), i, why
+        spans[i, 0], spans[i, 1], numbers[i] = start, end, number
+        bits &= bits - np.uint64(1)
+        if bits == 0:
+            j += TESTED_AT_ONCE
+    return j, bits, SAMPLES_AT_ONCE, GOES_ON
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
 def _composite(
     size: int,
     intervals: Any,
@@ -168,11 +194,14 @@ def _composite(
     lanes: Any,
 ) -> Any:
     """Composite gathered intervals behind a ray's state; where it goes no further, and why not."""
-    splits, min_weight, split_weight, stop_transmittance = options
+    splits, min_weight, split_weight, stop_transmittance, faint = options
     spans, numbers = intervals
     for i in range(size):
         start, end = spans[i]
-        opacity = _opacity(found, i, end - start, contents, values, lanes)
+        log_density = _log_density(found, i, contents, values, lanes)
+        if splits > 1 and log_density <= faint:
+            continue
+        opacity = _opacity(log_density, end - start)
         weight = state[0] * opacity
         if splits == 1 or min_weight < weight <= split_weight:
             _add(state, opacity, np.float32(0.5) * (start + end), values, contents[4])
@@ -188,20 +217,20 @@ def _composite(
                 if why != GOES_ON:
                     return numbers[i], why
             for k in range(splits):
-                opacity = _opacity(parts, k, length, contents, values, lanes)
+                opacity = _opacity(_log_density(parts, k, contents, values, lanes), length)
                 _add(state, opacity, _part(start, k, length), values, contents[4])
         if not state[0] > stop_transmittance:
             return numbers[i], DONE
     return 0, GOES_ON
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
 def _part(start: Any, k: int, length: Any) -> Any:
     """Where the middle of a part of an interval is."""
     return start + (np.float32(k) + np.float32(0.5)) * length
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
 def _find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: int, moved: Any) -> Any:
     """Find in which row the contents at a distance begin, and the fractions in its cell; or what is lacking."""
     why, (x, y, z), (px, py, pz) = _brick(middle, course, lattice, contents, moved)
@@ -218,7 +247,7 @@ def _find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: 
     return GOES_ON
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
 def _brick(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) -> Any:
     """Whether a distance lies in a brick that exists, or why not; its cell; and the place, in cells."""
     displacements, is_known, low, sides = lattice
@@ -257,7 +286,7 @@ def _mark_brick(
             return
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
 def _place(middle: Any, course: Any, is_known: Any, low: Any, sides: Any) -> Any:
     """Whether a distance lies in the lattice, its position, its cell there, and the fractions in the cell."""
     (ox, oy, oz), (dx, dy, dz) = course[:2]
@@ -272,18 +301,24 @@ def _place(middle: Any, course: Any, is_known: Any, low: Any, sides: Any) -> Any
     return is_in, (px, py, pz), (x, y, z), (u, v, w)
 
 
-@njit(**BORROWS)
-def _opacity(found: Any, i: int, length: Any, contents: Any, values: Any, lanes: Any) -> Any:
-    """Look up the contents at a place that was found, and what an interval of them absorbs."""
+@njit(forceinline=True, **BORROWS)
+def _log_density(found: Any, i: int, contents: Any, values: Any, lanes: Any) -> Any:
+    """Look up the contents at a place that was found; the logarithm of their density."""
     rows, fractions = found
     bricks, waves, log_shift = contents[1], contents[4], contents[5]
     weights = corner_weights(fractions[i, 0], fractions[i, 1], fractions[i, 2])
     blend_rows(bricks, corner_rows(rows[i]), weights, values, 0, lanes)
     raw, most = log_shift + _total(values, 0, waves), np.float32(MOST_LOG_DENSITY)
-    return -math.expm1(-math.exp(most if raw > most else raw) * length)
+    return most if raw > most else raw
 
 
-@njit(**BORROWS)
+@njit(forceinline=True, **BORROWS)
+def _opacity(log_density: Any, length: Any) -> Any:
+    """What an interval absorbs."""
+    return -math.expm1(-math.exp(log_density) * length)
+
+
+@njit(forceinline=True, **BORROWS)
 def _add(state: Any, opacity: Any, distance: Any, values: Any, waves: Any) -> None:
     """Composite one interval behind a ray's state."""
     num_terms = len(waves)
@@ -298,21 +333,34 @@ def _add(state: Any, opacity: Any, distance: Any, values: Any, waves: Any) -> No
 
 @njit(**BORROWS)
 def _mark_ahead(
-    j: int, count: int, course: Any, occupancy: Any, skips: Any, lattice: Any, splits: int, vertices: Any
+    j: int,
+    count: int,
+    course: Any,
+    occupancy: Any,
+    skips: Any,
+    lattice: Any,
+    splits: int,
+    vertices: Any,
+    cells: Any,
 ) -> None:
     """Mark the unknown vertices around a waiting ray's interval and the next ones."""
     _, is_known, low, sides = lattice
+    bits = np.uint64(0)
     for _ in range(LOOK_AHEAD):
-        j, start, end = next_kept(j, count, course, occupancy, skips)
-        if j >= count:
-            return
+        if bits == 0:
+            j, bits = next_kept(j, count, course, occupancy, skips, cells)
+            if bits == 0:
+                return
+        start, end = ends_of(j + int(trailing_zeros(bits)), course)
         length = (end - start) / np.float32(splits)
         for k in range(splits + 1):  # the parts' middles, then that of the whole
             middle = np.float32(0.5) * (start + end) if k == splits else _part(start, k, length)
             is_in, _, (x, y, z), _ = _place(middle, course, is_known, low, sides)
             if is_in:
                 _mark(vertices, is_known, x, y, z)
-        j += 1
+        bits &= bits - np.uint64(1)
+        if bits == 0:
+            j += TESTED_AT_ONCE
 
 
 @njit(**BORROWS)

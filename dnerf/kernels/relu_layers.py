@@ -1,0 +1,84 @@
+"""Layers of a ReLU network, one after the other."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .backend import choose
+
+# oneDNN's ReLU makes zeros of NaNs; with a slope below zero, however small, it keeps them.
+SLOPE = 1e-30
+PARTS = 8  # of a sum over rows: several sums at once are quicker than one of so many terms
+
+
+def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+    """ReLU(W x + b), layer after layer.
+
+    Under autocast to bfloat16, on CPUs that have it, oneDNN adds the bias and cuts off what is negative while it
+    multiplies: one pass over memory instead of three, whose time is what such small networks take. Sums are then
+    rounded in another order, and what was negative is -`SLOPE` times its size instead of zero.
+
+    Args:
+        inputs: (..., in_features).
+        weights: of each layer, at least one, (out_features, in_features).
+        biases: likewise, (out_features,).
+
+    Returns:
+        (..., out_features of the last layer), differentiable to any order.
+    """
+    if not (_is_bfloat16_wanted(inputs) and choose(inputs) != "reference"):
+        return relu_layers_reference(inputs, weights, biases)
+    parameters = [p.bfloat16() for p in (*weights, *biases)]
+    outputs = _Layers.apply(inputs.reshape(-1, inputs.shape[-1]).bfloat16(), *parameters)
+    return outputs.reshape(*inputs.shape[:-1], len(biases[-1]))
+
+
+def relu_layers_reference(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+    """The definition of `relu_layers` in plain torch."""
+    for weight, bias in zip(weights, biases, strict=True):
+        inputs = torch.relu_(torch.nn.functional.linear(inputs, weight, bias))
+    return inputs
+
+
+def _is_bfloat16_wanted(inputs: Tensor) -> bool:
+    return (
+        inputs.is_cpu
+        and inputs.dtype != torch.float64
+        and torch.is_autocast_enabled("cpu")
+        and torch.get_autocast_dtype("cpu") == torch.bfloat16
+        and torch.backends.mkldnn.is_available()
+        and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    )
+
+
+class _Layers(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, *parameters: Tensor) -> Tensor:
+        outputs, num_layers = [inputs], len(parameters) // 2
+        for weight, bias in zip(parameters[:num_layers], parameters[num_layers:], strict=True):
+            outputs.append(torch.ops.mkldnn._linear_pointwise(outputs[-1], weight, bias, "leaky_relu", [SLOPE], ""))
+        ctx.save_for_backward(*outputs, *parameters[:num_layers])
+        return outputs[-1]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        num_layers = len(ctx.saved_tensors) // 2
+        outputs, weights = ctx.saved_tensors[: num_layers + 1], ctx.saved_tensors[num_layers + 1 :]
+        grad = grads[0]
+        of_weights, of_biases = [grad] * num_layers, [grad] * num_layers
+        for i in reversed(range(num_layers)):
+            grad = torch.ops.aten.threshold_backward(grad, outputs[i + 1], 0)
+            of_weights[i], of_biases[i] = _outer_sum(grad, outputs[i]), grad.sum(0)
+            if i or ctx.needs_input_grad[0]:
+                grad = grad @ weights[i]
+        return grad if ctx.needs_input_grad[0] else None, *of_weights, *of_biases
+
+
+def _outer_sum(left: Tensor, right: Tensor) -> Tensor:
+    """The sum over rows of their outer products: (N, A), (N, B) -> (A, B)."""
+    if len(left) % PARTS:
+        return left.mT @ right
+    products = left.unflatten(0, (PARTS, -1)).mT @ right.unflatten(0, (PARTS, -1))
+    return products.float().sum(0).to(left.dtype)

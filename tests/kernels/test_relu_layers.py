@@ -1,0 +1,100 @@
+"""Fused layers against layer after layer."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from dnerf.kernels import relu_layers, use_backend
+from dnerf.kernels.relu_layers import relu_layers_reference
+
+has_bfloat16 = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+fused = pytest.mark.skipif(not has_bfloat16, reason="this CPU has no products in bfloat16")
+
+
+def layers(*widths: int, seed: int = 0) -> nn.ModuleList:
+    torch.manual_seed(seed)
+    return nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
+
+
+def parameters(network: nn.ModuleList) -> tuple[list[Tensor], list[Tensor]]:
+    return [layer.weight for layer in network], [layer.bias for layer in network]  # type: ignore[misc]
+
+
+def under_autocast(backend: str, inputs: Tensor, network: nn.ModuleList) -> Tensor:
+    with use_backend(backend), torch.autocast("cpu", torch.bfloat16):
+        return relu_layers(inputs, *parameters(network))
+
+
+def test_definition_is_layer_after_layer() -> None:
+    network, inputs = layers(3, 5, 4).double(), torch.randn(7, 3, dtype=torch.float64)
+    hidden = (inputs @ network[0].weight.T + network[0].bias).clamp(min=0)
+    expected = (hidden @ network[1].weight.T + network[1].bias).clamp(min=0)
+    torch.testing.assert_close(relu_layers(inputs, *parameters(network)), expected)
+    torch.testing.assert_close(relu_layers_reference(inputs, *parameters(network)), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_without_autocast_nothing_is_rounded(dtype: torch.dtype) -> None:
+    network, inputs = layers(6, 16, 16).to(dtype), torch.randn(32, 6, dtype=dtype)
+    assert torch.equal(relu_layers(inputs, *parameters(network)), relu_layers_reference(inputs, *parameters(network)))
+
+
+@fused
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (7,), (64,), (2, 0), (3, 5), (4096,)])
+@pytest.mark.parametrize("widths", [(3, 8), (32, 128, 128, 128, 128), (40, 64, 64), (5, 17, 3)])
+def test_fused_agrees_forward_and_backward(shape: tuple[int, ...], widths: tuple[int, ...]) -> None:
+    network = layers(*widths)
+    plain, quick = (torch.randn(*shape, widths[0], generator=torch.Generator().manual_seed(1)) for _ in range(2))
+    found = []
+    for backend, inputs in (("reference", plain), ("auto", quick)):
+        network.zero_grad()
+        inputs.requires_grad_()
+        outputs = under_autocast(backend, inputs, network)
+        outputs.float().square().sum().backward()
+        found.append([outputs, inputs.grad, *(p.grad for p in network.parameters())])
+    for expected, got in zip(*found, strict=True):
+        assert got.shape == expected.shape
+        assert got.dtype == expected.dtype
+        size = float(expected.detach().abs().max()) if expected.numel() else 0.0
+        torch.testing.assert_close(got, expected, rtol=2e-2, atol=2e-2 * size)
+
+
+@fused
+def test_gradients_of_either_kind_may_be_left_out() -> None:
+    network, inputs = layers(4, 16, 16), torch.randn(64, 4)
+    under_autocast("auto", inputs, network).sum().backward()
+    assert all(p.grad is not None for p in network.parameters())
+    network.zero_grad()
+    network.requires_grad_(False)
+    inputs.requires_grad_()
+    under_autocast("auto", inputs, network).sum().backward()
+    assert inputs.grad is not None
+    assert all(p.grad is None for p in network.parameters())
+
+
+@fused
+def test_second_derivatives_agree() -> None:
+    network, found = layers(4, 32, 32), []
+    for backend in ("reference", "auto"):
+        inputs = torch.linspace(-1, 1, 64).reshape(16, 4).requires_grad_()
+        outputs = under_autocast(backend, inputs, network).float().square().sum()
+        (slope,) = torch.autograd.grad(outputs, inputs, create_graph=True)
+        network.zero_grad()
+        slope.square().sum().backward()
+        found.append(network[0].weight.grad.clone())  # type: ignore[union-attr]
+    torch.testing.assert_close(found[1], found[0], rtol=5e-2, atol=5e-2 * float(found[0].abs().max()))
+
+
+@fused
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_what_is_not_finite_is_not_hidden(bad: float) -> None:
+    network, inputs = layers(4, 32, 32, 32), torch.randn(9, 4)
+    inputs[3, 1] = bad
+    outputs = under_autocast("auto", inputs, network)
+    assert not outputs[3].isfinite().all()
+    assert outputs[torch.arange(9) != 3].isfinite().all()
+    with torch.no_grad():
+        network[0].weight[5, 2] = float("nan")
+    assert not under_autocast("auto", inputs, network).isfinite().any()
