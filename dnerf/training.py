@@ -100,6 +100,9 @@ class Trainer:
         ):
             check_positive(name, value)
         check_choice("schedule", schedule, SCHEDULES)
+        for name, every in (loss_every or {}).items():
+            if int(every) != every:
+                raise ValueError(f"loss_every.{name} must be a whole number of steps, got {every}")
         self.num_steps = num_steps
         self.max_seconds = max_seconds
         self.num_rays = num_rays

@@ -172,7 +172,7 @@ def test_a_step_without_any_loss_changes_nothing(frames):
     assert seen == [True, False]
 
 
-@pytest.mark.parametrize("every", [0, -1])
-def test_turns_must_be_positive(every):
-    with pytest.raises(ValueError, match=r"loss_every\.haze must be > 0"):
+@pytest.mark.parametrize(("every", "expected"), [(0, "> 0"), (-1, "> 0"), (1.5, "a whole number")])
+def test_turns_must_be_whole_and_positive(every, expected):
+    with pytest.raises(ValueError, match=rf"loss_every\.haze must be {expected}"):
         trainer(loss_every={"haze": every})

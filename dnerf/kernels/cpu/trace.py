@@ -12,9 +12,7 @@ from torch import Tensor
 from ..brick_lookup import BRICK_BITS, VERTICES
 from ..trace import DONE, ELSEWHERE, LACKS_BRICK, LACKS_VERTEX, LOOK_AHEAD, MOST_LOG_DENSITY
 from .brick_lookup import SIDE, cell_of, corner_rows, corner_weights, first_row, is_inside
-from .grid_encode import locate, trilinear_weights
-from .launch import BORROWS, FAST, launch, num_threads
-from .march import (
+from .course import (
     LINE,
     RAYS_AT_ONCE,
     TESTED_AT_ONCE,
@@ -24,7 +22,9 @@ from .march import (
     ends_of,
     next_kept,
     ray_ranges,
-)  # fmt: skip
+)
+from .grid_encode import locate, trilinear_weights
+from .launch import BORROWS, FAST, launch, num_threads
 from .rows import blend_rows, prefetch_row, trailing_zeros
 
 SAMPLES_AT_ONCE = 8  # of a ray: while one is waiting for memory, the others are
