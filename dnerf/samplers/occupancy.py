@@ -18,7 +18,7 @@ from dnerf.sparse import few_nonzero
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
-MOST_AT_ONCE = 1 << 17  # samples that the filter asks, where many rays meet haze: about 100 MiB in the networks' layers
+MOST_AT_ONCE = 1 << 16  # samples that the filter asks, where many rays meet haze: about 50 MiB in the networks' layers
 
 
 class OccupancySampler(OccupancyGrid):
