@@ -77,7 +77,6 @@ class GridField(RadianceField):
         levels = torch.arange(self.levels.num_levels)
         self.register_buffer("window", (levels == 0).float(), persistent=window_end is not None)
         self.window: Tensor
-        self.is_open = window_end is None
         self.register_buffer("low", corners[0], persistent=False)
         self.register_buffer("scale", 1 / sides, persistent=False)
         self.low: Tensor
@@ -110,7 +109,6 @@ class GridField(RadianceField):
         """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
         if self.window_end is None:
             return
-        self.is_open = progress >= self.window_end
         levels = torch.arange(len(self.window), device=self.window.device)
         opened = (len(levels) - 1) * min(progress / self.window_end, 1.0) - levels + 1
         self.window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))
@@ -119,7 +117,7 @@ class GridField(RadianceField):
         unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
         features = grid_encode(unit.reshape(-1, 3), self.table, self.levels)
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
-        if not self.is_open:
+        if self.window_end is not None:
             features = features * self.window.repeat_interleave(self.table.shape[1]).to(features.dtype)
         if self.encode_times is not None:
             assert times is not None

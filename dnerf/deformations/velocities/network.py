@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from dnerf.checks import check_positive
 from dnerf.deformations.velocities.base import BoxWindow, Velocity
 from dnerf.encodings import SinusoidalEncoding
-from dnerf.kernels import relu_layers
-from dnerf.mlp import ACTIVATIONS, MLP
+from dnerf.mlp import ACTIVATIONS, MLP, dense_layers
 
 
 class NetworkVelocity(Velocity):
@@ -80,10 +79,7 @@ class NetworkVelocity(Velocity):
         def velocity(positions: Tensor) -> Tensor:
             inside = self.window.inside(positions)
             inputs = torch.cat([*self.encode_positions.parts(inside), of_times], dim=-1)
-            if self.activation is torch.relu_:
-                hidden = relu_layers(inputs, [weight], [bias])
-            else:
-                hidden = self.activation(nn.functional.linear(inputs, weight, bias))
+            hidden = dense_layers(inputs, [weight], [bias], self.activation)
             return self.window(positions) * self.mlp(hidden).to(positions.dtype)
 
         return velocity

@@ -10,8 +10,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..brick_lookup import BRICK_BITS, VERTICES
-from ..trace import DONE, ELSEWHERE, LACKS_BRICK, LACKS_VERTEX, LOOK_AHEAD, MOST_LOG_DENSITY
-from .brick_lookup import SIDE, cell_of, corner_rows, corner_weights, first_row, is_inside
+from ..trace import DONE, LACKS_BRICK, LACKS_VERTEX, LOOK_AHEAD
 from .course import (
     LINE,
     RAYS_AT_ONCE,
@@ -23,13 +22,11 @@ from .course import (
     next_kept,
     ray_ranges,
 )
-from .grid_encode import locate, trilinear_weights
-from .launch import BORROWS, FAST, launch, num_threads
-from .rows import blend_rows, prefetch_row, trailing_zeros
+from .frame_lookup import FOUR, GOES_ON, brick_at, find, log_density_at, opacity_of, place_at, sum_of_terms
+from .launch import BORROWS, launch, num_threads
+from .rows import trailing_zeros
 
 SAMPLES_AT_ONCE = 8  # of a ray: while one is waiting for memory, the others are
-FOUR = (0, 0, 0, 0)
-GOES_ON = 0  # between what ends a ray and what it may lack
 
 
 def trace(
@@ -168,7 +165,7 @@ def _gather(
                 return j, bits, i, DONE
         number = j + int(trailing_zeros(bits))
         start, end = ends_of(number, course)
-        why = _find(np.float32(0.5) * (start + end), course, lattice, contents, found, i, moved)
+        why = find(np.float32(0.5) * (start + end), course, lattice, contents, found, i, moved)
         if why != GOES_ON:
             return number, np.uint64(0), i, why
         spans[i, 0], spans[i, 1], numbers[i] = start, end, number
@@ -198,10 +195,10 @@ def _composite(
     spans, numbers = intervals
     for i in range(size):
         start, end = spans[i]
-        log_density = _log_density(found, i, contents, values, lanes)
+        log_density = log_density_at(found, i, contents, values, lanes)
         if splits > 1 and log_density <= faint:
             continue
-        opacity = _opacity(log_density, end - start)
+        opacity = opacity_of(log_density, end - start)
         weight = state[0] * opacity
         if splits == 1 or min_weight < weight <= split_weight:
             _add(state, opacity, np.float32(0.5) * (start + end), values, contents[4])
@@ -213,11 +210,11 @@ def _composite(
                     for axis in range(3):
                         parts[1][k, axis] = found[1][i, axis]
                     continue
-                why = _find(_part(start, k, length), course, lattice, contents, parts, k, moved)
+                why = find(_part(start, k, length), course, lattice, contents, parts, k, moved)
                 if why != GOES_ON:
                     return numbers[i], why
             for k in range(splits):
-                opacity = _opacity(_log_density(parts, k, contents, values, lanes), length)
+                opacity = opacity_of(log_density_at(parts, k, contents, values, lanes), length)
                 _add(state, opacity, _part(start, k, length), values, contents[4])
         if not state[0] > stop_transmittance:
             return numbers[i], DONE
@@ -230,48 +227,6 @@ def _part(start: Any, k: int, length: Any) -> Any:
     return start + (np.float32(k) + np.float32(0.5)) * length
 
 
-@njit(forceinline=True, **BORROWS)
-def _find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: int, moved: Any) -> Any:
-    """Find in which row the contents at a distance begin, and the fractions in its cell; or what is lacking."""
-    why, (x, y, z), (px, py, pz) = _brick(middle, course, lattice, contents, moved)
-    if why != GOES_ON:
-        return why
-    slots, bricks = contents[0], contents[1]
-    row = first_row(x, y, z, slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS])
-    for corner in (row, row + SIDE, row + SIDE * SIDE, row + SIDE * SIDE + SIDE):
-        prefetch_row(bricks, corner)
-        prefetch_row(bricks, corner + 1)
-    rows, fractions = found
-    rows[i] = row
-    fractions[i, 0], fractions[i, 1], fractions[i, 2] = px - np.float32(x), py - np.float32(y), pz - np.float32(z)
-    return GOES_ON
-
-
-@njit(forceinline=True, **BORROWS)
-def _brick(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) -> Any:
-    """Whether a distance lies in a brick that exists, or why not; its cell; and the place, in cells."""
-    displacements, is_known, low, sides = lattice
-    slots, _, brick_low, cells_per_unit = contents[:4]
-    is_in, (px, py, pz), (x, y, z), (u, v, w) = _place(middle, course, is_known, low, sides)
-    if not is_in:
-        return ELSEWHERE, (x, y, z), (px, py, pz)
-    _, ly, lx = is_known.shape
-    a = np.int64(x + lx * (y + ly * z))
-    b, c = a + lx, a + lx * ly
-    d = c + lx
-    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, FOUR)
-    if math.isnan(moved[0]):
-        return LACKS_VERTEX, (x, y, z), (px, py, pz)
-    px = (px + moved[0] - brick_low[0]) * cells_per_unit
-    py = (py + moved[1] - brick_low[1]) * cells_per_unit
-    pz = (pz + moved[2] - brick_low[2]) * cells_per_unit
-    if not is_inside(px, py, pz, slots):
-        return ELSEWHERE, (x, y, z), (px, py, pz)
-    x, y, z = cell_of(px, py, pz, slots)
-    exists = slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS] >= 0
-    return GOES_ON if exists else LACKS_BRICK, (x, y, z), (px, py, pz)
-
-
 @njit(**BORROWS)
 def _mark_brick(
     start: Any, end: Any, splits: int, course: Any, lattice: Any, contents: Any, moved: Any, wanted: Any
@@ -280,42 +235,10 @@ def _mark_brick(
     length = (end - start) / np.float32(splits)
     for k in range(-1, splits):
         middle = np.float32(0.5) * (start + end) if k < 0 else _part(start, k, length)
-        why, (x, y, z), _ = _brick(middle, course, lattice, contents, moved)
+        why, (x, y, z), _ = brick_at(middle, course, lattice, contents, moved)
         if why == LACKS_BRICK:
             wanted[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS] = True
             return
-
-
-@njit(forceinline=True, **BORROWS)
-def _place(middle: Any, course: Any, is_known: Any, low: Any, sides: Any) -> Any:
-    """Whether a distance lies in the lattice, its position, its cell there, and the fractions in the cell."""
-    (ox, oy, oz), (dx, dy, dz) = course[:2]
-    one, zero = np.float32(1), np.float32(0)
-    px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
-    u, v, w = (px - low[0]) / sides[0], (py - low[1]) / sides[1], (pz - low[2]) / sides[2]
-    is_in = zero <= u <= one and zero <= v <= one and zero <= w <= one
-    lz, ly, lx = is_known.shape
-    x, u = locate(u, lx - 1)
-    y, v = locate(v, ly - 1)
-    z, w = locate(w, lz - 1)
-    return is_in, (px, py, pz), (x, y, z), (u, v, w)
-
-
-@njit(forceinline=True, **BORROWS)
-def _log_density(found: Any, i: int, contents: Any, values: Any, lanes: Any) -> Any:
-    """Look up the contents at a place that was found; the logarithm of their density."""
-    rows, fractions = found
-    bricks, waves, log_shift = contents[1], contents[4], contents[5]
-    weights = corner_weights(fractions[i, 0], fractions[i, 1], fractions[i, 2])
-    blend_rows(bricks, corner_rows(rows[i]), weights, values, 0, lanes)
-    raw, most = log_shift + _total(values, 0, waves), np.float32(MOST_LOG_DENSITY)
-    return most if raw > most else raw
-
-
-@njit(forceinline=True, **BORROWS)
-def _opacity(log_density: Any, length: Any) -> Any:
-    """What an interval absorbs."""
-    return -math.expm1(-math.exp(log_density) * length)
 
 
 @njit(forceinline=True, **BORROWS)
@@ -325,7 +248,7 @@ def _add(state: Any, opacity: Any, distance: Any, values: Any, waves: Any) -> No
     weight = state[0] * opacity
     for k in range(3):
         state[1 + k] += weight * (
-            np.float32(1) / (np.float32(1) + math.exp(-_total(values, (1 + k) * num_terms, waves)))
+            np.float32(1) / (np.float32(1) + math.exp(-sum_of_terms(values, (1 + k) * num_terms, waves)))
         )
     state[4] += weight * distance
     state[0] *= np.float32(1) - opacity
@@ -355,7 +278,7 @@ def _mark_ahead(
         length = (end - start) / np.float32(splits)
         for k in range(splits + 1):  # the parts' middles, then that of the whole
             middle = np.float32(0.5) * (start + end) if k == splits else _part(start, k, length)
-            is_in, _, (x, y, z), _ = _place(middle, course, is_known, low, sides)
+            is_in, _, (x, y, z), _ = place_at(middle, course, is_known, low, sides)
             if is_in:
                 _mark(vertices, is_known, x, y, z)
         bits &= bits - np.uint64(1)
@@ -371,12 +294,3 @@ def _mark(vertices: Any, is_known: Any, x: int, y: int, z: int) -> None:
             for a in range(x, x + 2):
                 if not is_known[c, b, a]:
                     vertices[c, b, a] = True
-
-
-@njit(fastmath=FAST | {"reassoc"}, **BORROWS)
-def _total(values: Any, first: int, waves: Any) -> Any:
-    """The sum of a series' terms times their waves."""
-    total = np.float32(0)
-    for k in range(len(waves)):
-        total += values[first + k] * waves[k]
-    return total

@@ -1,0 +1,104 @@
+# mypy: disable-error-code="call-arg,var-annotated"
+"""What a frame's tables hold at a distance along a ray, for the numba version of `trace`.
+
+numba's cache on disk does not notice a change here: touch that file as well.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from ..brick_lookup import BRICK_BITS
+from ..trace import ELSEWHERE, LACKS_BRICK, LACKS_VERTEX, MOST_LOG_DENSITY
+from .brick_lookup import SIDE, cell_of, corner_rows, corner_weights, first_row, is_inside
+from .grid_encode import locate, trilinear_weights
+from .launch import BORROWS, FAST
+from .rows import blend_rows, prefetch_row
+
+FOUR = (0, 0, 0, 0)
+GOES_ON = 0  # between what ends a ray and what it may lack
+
+
+@njit(forceinline=True, **BORROWS)
+def find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: int, moved: Any) -> Any:
+    """Find in which row the contents at a distance begin, and the fractions in its cell; or what is lacking."""
+    why, (x, y, z), (px, py, pz) = brick_at(middle, course, lattice, contents, moved)
+    if why != GOES_ON:
+        return why
+    slots, bricks = contents[0], contents[1]
+    row = first_row(x, y, z, slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS])
+    for corner in (row, row + SIDE, row + SIDE * SIDE, row + SIDE * SIDE + SIDE):
+        prefetch_row(bricks, corner)
+        prefetch_row(bricks, corner + 1)
+    rows, fractions = found
+    rows[i] = row
+    fractions[i, 0], fractions[i, 1], fractions[i, 2] = px - np.float32(x), py - np.float32(y), pz - np.float32(z)
+    return GOES_ON
+
+
+@njit(forceinline=True, **BORROWS)
+def brick_at(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) -> Any:
+    """Whether a distance lies in a brick that exists, or why not; its cell; and the place, in cells."""
+    displacements, is_known, low, sides = lattice
+    slots, _, brick_low, cells_per_unit = contents[:4]
+    is_in, (px, py, pz), (x, y, z), (u, v, w) = place_at(middle, course, is_known, low, sides)
+    if not is_in:
+        return ELSEWHERE, (x, y, z), (px, py, pz)
+    _, ly, lx = is_known.shape
+    a = np.int64(x + lx * (y + ly * z))
+    b, c = a + lx, a + lx * ly
+    d = c + lx
+    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, FOUR)
+    if math.isnan(moved[0]):
+        return LACKS_VERTEX, (x, y, z), (px, py, pz)
+    px = (px + moved[0] - brick_low[0]) * cells_per_unit
+    py = (py + moved[1] - brick_low[1]) * cells_per_unit
+    pz = (pz + moved[2] - brick_low[2]) * cells_per_unit
+    if not is_inside(px, py, pz, slots):
+        return ELSEWHERE, (x, y, z), (px, py, pz)
+    x, y, z = cell_of(px, py, pz, slots)
+    exists = slots[x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS] >= 0
+    return GOES_ON if exists else LACKS_BRICK, (x, y, z), (px, py, pz)
+
+
+@njit(forceinline=True, **BORROWS)
+def place_at(middle: Any, course: Any, is_known: Any, low: Any, sides: Any) -> Any:
+    """Whether a distance lies in the lattice, its position, its cell there, and the fractions in the cell."""
+    (ox, oy, oz), (dx, dy, dz) = course[:2]
+    one, zero = np.float32(1), np.float32(0)
+    px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
+    u, v, w = (px - low[0]) / sides[0], (py - low[1]) / sides[1], (pz - low[2]) / sides[2]
+    is_in = zero <= u <= one and zero <= v <= one and zero <= w <= one
+    lz, ly, lx = is_known.shape
+    x, u = locate(u, lx - 1)
+    y, v = locate(v, ly - 1)
+    z, w = locate(w, lz - 1)
+    return is_in, (px, py, pz), (x, y, z), (u, v, w)
+
+
+@njit(forceinline=True, **BORROWS)
+def log_density_at(found: Any, i: int, contents: Any, values: Any, lanes: Any) -> Any:
+    """Look up the contents at a place that was found; the logarithm of their density."""
+    rows, fractions = found
+    bricks, waves, log_shift = contents[1], contents[4], contents[5]
+    weights = corner_weights(fractions[i, 0], fractions[i, 1], fractions[i, 2])
+    blend_rows(bricks, corner_rows(rows[i]), weights, values, 0, lanes)
+    raw, most = log_shift + sum_of_terms(values, 0, waves), np.float32(MOST_LOG_DENSITY)
+    return most if raw > most else raw
+
+
+@njit(forceinline=True, **BORROWS)
+def opacity_of(log_density: Any, length: Any) -> Any:
+    """What an interval absorbs."""
+    return -math.expm1(-math.exp(log_density) * length)
+
+
+@njit(fastmath=FAST | {"reassoc"}, **BORROWS)
+def sum_of_terms(values: Any, first: int, waves: Any) -> Any:
+    """The sum of a series' terms times their waves."""
+    total = np.float32(0)
+    for k in range(len(waves)):
+        total += values[first + k] * waves[k]
+    return total
