@@ -104,9 +104,10 @@ def camera_rays(
     Returns:
         Rays with unit directions; `near` and `far` are distances, z-depth times the unnormalised direction's length.
     """
-    local = intrinsics.pixel_directions(columns, rows, poses.dtype)
-    lengths = local.norm(dim=-1)
-    directions = (poses[..., :3, :3] * (local / lengths[:, None])[:, None, :]).sum(-1)
+    local = intrinsics.pixel_directions(columns, rows, poses.dtype).unbind(-1)
+    lengths = _product(local, local).sqrt()
+    unit = [x / lengths for x in local]
+    directions = torch.stack([_product(poses[..., row, :3].unbind(-1), unit) for row in range(3)], dim=-1)
     origins = poses[..., :3, 3].expand(directions.shape)
     return Rays(origins, directions, times.to(poses.dtype), near * lengths, far * lengths)
 
@@ -145,14 +146,14 @@ class Camera:
         """
         check_last_axis("positions", positions, 3)
         camera, pose = self.intrinsics, self.pose.to(positions.dtype)
-        # Rows times the transposed rotation, without a matrix product, which GPUs may run in tf32.
-        local = ((positions - pose[:3, 3])[..., :, None] * pose[:3, :3]).sum(-2)
-        depth = -local[..., 2]
+        offsets = (positions - pose[:3, 3]).unbind(-1)
+        x, y, z = (_product(offsets, pose[:3, axis]) for axis in range(3))
+        depth = -z
         offset = PIXEL_OFFSETS[camera.pixel_origin]
         center_x = 0.5 * camera.width if camera.center_x is None else camera.center_x
         center_y = 0.5 * camera.height if camera.center_y is None else camera.center_y
-        columns = local[..., 0] / depth * camera.focal_x + (center_x - offset)
-        rows = center_y - offset - local[..., 1] / depth * camera.focal_y
+        columns = x / depth * camera.focal_x + (center_x - offset)
+        rows = center_y - offset - y / depth * camera.focal_y
         return torch.stack([columns, rows], dim=-1), depth
 
     def pixels_around(self, groups: Tensor) -> Tensor | None:
@@ -166,13 +167,14 @@ class Camera:
         Returns:
             Pixel numbers (P,) int64, `row * width + column`, in order; None if a point does not lie before the camera.
         """
-        positions, depth = self.project(groups)
+        # One group after the other in memory: reductions over short last axes are slow.
+        positions, depth = self.project(groups.transpose(0, 1).contiguous())
         if not bool((depth > 0).all() & positions.isfinite().all()):
             return None
         width, height = self.intrinsics.width, self.intrinsics.height
         size = torch.tensor([width, height], device=positions.device, dtype=positions.dtype)
-        low = torch.minimum(positions.amin(1).floor().clamp(min=0), size).long()
-        high = torch.minimum(positions.amax(1).ceil().clamp(min=-1) + 1, size).long()
+        low = torch.minimum(positions.amin(0).floor().clamp(min=0), size).long()
+        high = torch.minimum(positions.amax(0).ceil().clamp(min=-1) + 1, size).long()
         # How many rectangles hold a pixel is the sum of +1 and -1 at corners, over all that is above and to its left.
         changes = torch.zeros(height + 1, width + 1, device=positions.device)
         one = torch.ones((), device=positions.device)
@@ -199,6 +201,14 @@ class Camera:
             near=self.near,
             far=self.far,
         )
+
+
+def _product(left: Sequence[Tensor] | Tensor, right: Sequence[Tensor] | Tensor) -> Tensor:
+    """The scalar product of vectors given as three columns each.
+
+    Not a matrix product, which GPUs may run in tf32, nor a sum over an axis of three, which takes several times longer.
+    """
+    return left[0] * right[0] + left[1] * right[1] + left[2] * right[2]
 
 
 def look_at(

@@ -10,6 +10,7 @@ from dnerf.kernels import FrameTables, MarchGrid, trace
 from dnerf.kernels.backend import choose
 from dnerf.kernels.trace import DONE, NUM_STATES
 from dnerf.rays import Rays
+from dnerf.sparse import few_nonzero
 
 VERTICES_PER_RAY = 4  # most to ask around all occupied cells, instead of finding out which of them rays want
 PIONEERS = 5  # one ray of so many is sent ahead once, to find what most of its neighbours will want
@@ -102,8 +103,8 @@ class FrameTracer:
         That is what lies around occupied cells. Where matter is not few cells but haze, rays see little of it: some of
         them are followed ahead as far as they come, and what they want is filled.
         """
-        around = self.deformation.vertices_around(self.grid.occupancy, self.grid.aabb) & ~self.deformation.is_known
-        if int(around.sum()) <= VERTICES_PER_RAY * len(rays):
+        around = self.deformation.vertices_around(self.grid.occupancy, self.grid.aabb)
+        if len(around) <= VERTICES_PER_RAY * len(rays):
             self.deformation.fill(around)
             return
         numbers.fill_(DONE)
@@ -117,19 +118,19 @@ class FrameTracer:
         Which vertices are asked for together depends on the frame alone, not on the bricks that frames before it left.
 
         Returns:
-            The vertices that are wanted, as the deformation's.
+            The vertices that are wanted, flat places (K,) among the deformation's.
         """
         while True:
-            waiting = (numbers >= 0).nonzero()[:, 0]
-            some = rays[waiting]
-            states[waiting], numbers[waiting], vertices, bricks = trace(
-                some.origins, some.directions, some.near, some.far, states[waiting], numbers[waiting], self._tables(),
+            ahead, reached, vertices, bricks = trace(
+                rays.origins, rays.directions, rays.near, rays.far, states, numbers, self._tables(),
                 step=self.grid.step, splits=self.grid.splits, split_weight=self.grid.split_weight,
                 min_weight=self.stop_transmittance, stop_transmittance=self.stop_transmittance,
                 cells_per_unit=self.canonical.cells_per_unit, log_shift=self.log_shift,
             )  # fmt: skip
+            states.copy_(ahead)
+            numbers.copy_(reached)
             if not self.canonical.make(bricks.nonzero()):
-                return vertices.view_as(self.deformation.is_known)
+                return few_nonzero(vertices)
 
     def _tables(self) -> FrameTables:
         return FrameTables(

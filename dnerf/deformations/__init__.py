@@ -1,5 +1,6 @@
 """Deformations: world -> canonical."""
 
+from dnerf.deformations.along_rays import deform_along_rays
 from dnerf.deformations.base import Deformation, InvertibleDeformation
 from dnerf.deformations.displacement import DisplacementDeformation
 from dnerf.deformations.fixed_point import invert
@@ -21,5 +22,6 @@ __all__ = [
     "InvertibleDeformation",
     "LatticeFlow",
     "SkippingFlow",
+    "deform_along_rays",
     "invert",
 ]

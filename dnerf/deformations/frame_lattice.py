@@ -1,6 +1,7 @@
 """A deformation at one time, kept on a lattice: what a whole frame needs of it is computed once."""
 
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -103,40 +104,48 @@ class FrozenDeformation(Deformation):
         for axis in range(3):
             length = needed.shape[axis] - 1
             needed.narrow(axis, 1, length).logical_or_(needed.narrow(axis, 0, length).clone())
-        self.fill(needed & ~self.is_known)
+        self.fill(few_nonzero(needed & ~self.is_known))
 
     @torch.no_grad()
     def vertices_around(self, occupied: Tensor, aabb: Tensor) -> Tensor:
-        """Vertices (Lz + 1, Ly + 1, Lx + 1), bool, of the lattice's cells that share space with cells of another grid.
+        """Vertices, flat places (K,) int64, that are not known, of cells that share space with cells of another grid.
 
         Args:
             occupied: (Gx, Gy, Gz) bool, which of the other grid's.
             aabb: (2, 3) box that the other grid fills, in world units.
         """
-        covered = []
-        for axis, (size, cells) in enumerate(zip(occupied.shape, self.levels.cells, strict=True)):
+        around = torch.nn.functional.pad(occupied.permute(2, 1, 0), (0, 1) * 3)
+        for axis in range(3):  # the last axis of memory first, while there is least of it
+            size, cells = occupied.shape[axis], self.levels.cells[axis]
             faces = torch.lerp(aabb[0, axis], aabb[1, axis], torch.linspace(0, 1, size + 1, device=aabb.device))
-            vertex = torch.arange(cells + 1, device=aabb.device)[:, None]
             place = (faces - self.low[axis]) / self.sides[axis] * cells
-            covered.append(((place[:-1].floor() <= vertex) & (vertex <= place[1:].ceil())).float())
-        x, y, z = covered  # (vertices, cells of the other grid)
-        reached = y @ (occupied.permute(2, 1, 0).float() @ x.T)
-        return (z @ reached.flatten(1) > 0).view_as(self.is_known)
+            vertices = torch.arange(cells + 1, device=place.device, dtype=place.dtype)
+            first = torch.searchsorted(place[1:].ceil(), vertices)
+            last = torch.searchsorted(place[:-1].floor(), vertices, right=True) - 1
+            first, last = (torch.where(first <= last, x, size) for x in (first, last))
+            reached = [
+                around.index_select(2 - axis, torch.minimum(first + k, last))
+                for k in range(int((last - first).amax()) + 1)
+            ]
+            around = reduce(torch.logical_or, reached)
+        return few_nonzero(around & ~self.is_known)
 
     @torch.no_grad()
-    def fill(self, wanted: Tensor) -> bool:
-        """Ask the deformation at the vertices (Lz + 1, Ly + 1, Lx + 1) that are wanted, bool.
+    def fill(self, places: Tensor) -> bool:
+        """Ask the deformation at the vertices whose flat places (K,) among (Lz + 1, Ly + 1, Lx + 1) are given.
 
         Returns:
             Whether there were any.
         """
-        places = few_nonzero(wanted)
         if not len(places):
             return False
         padded = torch.cat([places, places[-1:].expand(-len(places) % self.pad_to)])
-        grid = torch.stack(torch.unravel_index(padded, wanted.shape), dim=-1).flip(-1)
-        size = torch.tensor(self.levels.cells, device=places.device)
-        vertices = self.low + self.sides * grid / size
+        columns = []
+        for axis, place in enumerate(reversed(torch.unravel_index(padded, self.is_known.shape))):
+            cells = self.levels.cells[axis]
+            faces = self.low[axis] + self.sides[axis] * torch.arange(cells + 1, device=padded.device) / cells
+            columns.append(faces[place])
+        vertices = torch.stack(columns, dim=-1)
         displaced = self.deformation(vertices, vertices.new_full((len(vertices),), self.time)) - vertices
         self.displacements[places] = torch.nn.functional.pad(displaced[: len(places)].float(), (0, 1))
         self.is_known.view(-1)[places] = True

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from dnerf.checks import check_positive
 from dnerf.compositing import FieldOutput
-from dnerf.deformations import Deformation, FrameLattice, IdentityDeformation
+from dnerf.deformations import Deformation, FrameLattice, IdentityDeformation, deform_along_rays
 from dnerf.fields.baked import Baking
 from dnerf.fields.base import RadianceField
 
@@ -22,6 +23,11 @@ class DeformedField(RadianceField):
         frame_lattice: where frames see the deformation through a lattice; None for frames that ask it at every sample.
         baking: how the contents of a finished canonical field are kept for the frames of a sequence, if it has any;
             None for frames that ask it at every sample.
+        spacing: along a ray, in world units, at which the deformation is asked in training, with displacements
+            interpolated in between, see `deform_along_rays`; None to ask it at every sample.
+
+    Raises:
+        ValueError: if the spacing is not positive.
     """
 
     def __init__(
@@ -29,10 +35,14 @@ class DeformedField(RadianceField):
         deformation: Deformation,
         canonical: RadianceField,
         *,
+        spacing: float | None = None,
         frame_lattice: FrameLattice | None = None,
         baking: Baking | None = None,
     ) -> None:
         super().__init__()
+        if spacing is not None:
+            check_positive("spacing", spacing)
+        self.spacing = spacing
         self.deformation = deformation
         self.canonical = canonical
         self.frame_lattice = frame_lattice
@@ -40,14 +50,19 @@ class DeformedField(RadianceField):
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at positions (..., 3) and times (...,)."""
-        return self.canonical.density(self.deformation(positions, times), times)
+        return self.canonical.density(self._deformed(positions, times), times)
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at positions (..., 3), directions (..., 3) and times (...,)."""
-        canonical_positions = self.deformation(positions, times)
+        canonical_positions = self._deformed(positions, times)
         output = self.canonical(canonical_positions, directions, times)
         extras = {"canonical_positions": canonical_positions, "positions": positions, "times": times}
         return replace(output, extras={**output.extras, **extras})
+
+    def _deformed(self, positions: Tensor, times: Tensor) -> Tensor:
+        if self.spacing is None or not self.training or isinstance(self.deformation, IdentityDeformation):
+            return self.deformation(positions, times)
+        return deform_along_rays(self.deformation, positions, times, self.spacing)
 
     def finished(self) -> RadianceField:
         """The same with the canonical field baked, if that is wanted and can be done."""

@@ -8,6 +8,7 @@ from .packed_sum import packed_sum
 from .packed_weights import packed_weights
 from .relu_layers import relu_layers
 from .skip_distances import skip_distances
+from .thin_out import thin_out
 from .trace import FrameTables, trace
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "relu_layers",
     "set_backend",
     "skip_distances",
+    "thin_out",
     "trace",
     "use_backend",
 ]

@@ -1,5 +1,6 @@
 """A canonical field seen through a deformation."""
 
+import pytest
 import torch
 from reference import FormulaField
 from torch import Tensor
@@ -45,3 +46,36 @@ def test_canonical_positions_come_with_the_output_and_extras_are_kept() -> None:
     assert torch.equal(extras["positions"], positions)
     assert torch.equal(extras["times"], times)
     assert torch.equal(extras["canonical_positions"], Drift()(positions, times))
+
+
+class Counting(Drift):
+    """Counts what it is asked."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.num_points = 0
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        self.num_points += len(positions)
+        return super().forward(positions, times)
+
+
+def test_samples_of_a_ray_share_evaluations_of_the_deformation_in_training_only() -> None:
+    field = DeformedField(Counting(), Gray(), spacing=0.05)
+    positions = torch.linspace(0, 1, 5001)[:, None] * torch.tensor([0.6, 0.0, 0.8])
+    times = torch.full((5001,), 0.25)
+    for ask in (lambda: field.density(positions, times), lambda: field(positions, positions, times)):
+        for training, expected in ((True, 1024), (False, 5001)):
+            field.train(training)
+            field.deformation.num_points = 0
+            ask()
+            assert field.deformation.num_points == expected
+    torch.testing.assert_close(
+        field.train()(positions, positions, times).extras["canonical_positions"], Drift()(positions, times)
+    )
+
+
+@pytest.mark.parametrize("spacing", [0.0, -0.1, float("nan"), float("inf")])
+def test_a_spacing_that_is_not_positive_is_refused(spacing: float) -> None:
+    with pytest.raises(ValueError, match="spacing must be > 0 and finite"):
+        DeformedField(Drift(), Gray(), spacing=spacing)
