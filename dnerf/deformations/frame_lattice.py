@@ -1,7 +1,7 @@
 """A deformation at one time, kept on a lattice: what a whole frame needs of it is computed once."""
 
 from collections.abc import Sequence
-from functools import reduce
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -114,20 +114,24 @@ class FrozenDeformation(Deformation):
             occupied: (Gx, Gy, Gz) bool, which of the other grid's.
             aabb: (2, 3) box that the other grid fills, in world units.
         """
-        around = torch.nn.functional.pad(occupied.permute(2, 1, 0), (0, 1) * 3)
-        for axis in range(3):  # the last axis of memory first, while there is least of it
+        firsts, lasts = [], []
+        for axis, cell in enumerate(torch.unravel_index(few_nonzero(occupied), occupied.shape)):
             size, cells = occupied.shape[axis], self.levels.cells[axis]
             faces = torch.lerp(aabb[0, axis], aabb[1, axis], torch.linspace(0, 1, size + 1, device=aabb.device))
             place = (faces - self.low[axis]) / self.sides[axis] * cells
-            vertices = torch.arange(cells + 1, device=place.device, dtype=place.dtype)
-            first = torch.searchsorted(place[1:].ceil(), vertices)
-            last = torch.searchsorted(place[:-1].floor(), vertices, right=True) - 1
-            first, last = (torch.where(first <= last, x, size) for x in (first, last))
-            reached = [
-                around.index_select(2 - axis, torch.minimum(first + k, last))
-                for k in range(int((last - first).amax()) + 1)
+            firsts.append(place[:-1].floor().clamp(min=0).long()[cell])
+            lasts.append(place[1:].ceil().clamp(max=cells).long()[cell])
+        first, last = torch.stack(firsts), torch.stack(lasts)
+        first, last = (x[:, (first <= last).all(0)] for x in (first, last))
+        around = torch.zeros_like(self.is_known)
+        if first.shape[1]:
+            _, rows, columns = around.shape
+            parts = [
+                [torch.minimum(a + k, b) * stride for k in range(int((b - a).amax()) + 1)]
+                for a, b, stride in zip(first, last, (1, columns, rows * columns), strict=True)
             ]
-            around = reduce(torch.logical_or, reached)
+            for x, y, z in product(*parts):
+                around.view(-1).index_fill_(0, x + y + z, True)
         return few_nonzero(around & ~self.is_known)
 
     @torch.no_grad()

@@ -35,7 +35,8 @@ def with_numba(*arguments):
 def test_numba_equals_reference_on_random_rays(counts, gap, doubled, seed):
     points, times = samples_of_rays(counts, gap, seed)
     if len(points):  # as samples are padded
-        points, times = torch.cat([points, points[-1:].expand(doubled, 3)]), torch.cat([times, times[-1:].repeat(doubled)])
+        points = torch.cat([points, points[-1:].expand(doubled, 3)])
+        times = torch.cat([times, times[-1:].expand(doubled)])
     for found, expected in zip(with_numba(points, times, 0.1), thin_out_reference(points, times, 0.1), strict=True):
         assert torch.equal(found, expected)
 

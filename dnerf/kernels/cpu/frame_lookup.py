@@ -13,6 +13,7 @@ from numba import njit
 from ..brick_lookup import BRICK_BITS
 from ..trace import ELSEWHERE, LACKS_BRICK, LACKS_VERTEX, MOST_LOG_DENSITY
 from .brick_lookup import SIDE, cell_of, corner_rows, corner_weights, first_row, is_inside
+from .exponential import exp, expm1
 from .grid_encode import locate, trilinear_weights
 from .launch import BORROWS, FAST
 from .rows import blend_rows, prefetch_row
@@ -92,7 +93,7 @@ def log_density_at(found: Any, i: int, contents: Any, values: Any, lanes: Any) -
 @njit(forceinline=True, **BORROWS)
 def opacity_of(log_density: Any, length: Any) -> Any:
     """What an interval absorbs."""
-    return -math.expm1(-math.exp(log_density) * length)
+    return -expm1(-exp(log_density) * length)
 
 
 @njit(fastmath=FAST | {"reassoc"}, **BORROWS)

@@ -22,6 +22,7 @@ from .course import (
     next_kept,
     ray_ranges,
 )
+from .exponential import sigmoid
 from .frame_lookup import FOUR, GOES_ON, brick_at, find, log_density_at, opacity_of, place_at, sum_of_terms
 from .launch import BORROWS, launch, num_threads
 from .rows import trailing_zeros
@@ -247,9 +248,7 @@ def _add(state: Any, opacity: Any, distance: Any, values: Any, waves: Any) -> No
     num_terms = len(waves)
     weight = state[0] * opacity
     for k in range(3):
-        state[1 + k] += weight * (
-            np.float32(1) / (np.float32(1) + math.exp(-sum_of_terms(values, (1 + k) * num_terms, waves)))
-        )
+        state[1 + k] += weight * sigmoid(sum_of_terms(values, (1 + k) * num_terms, waves))
     state[4] += weight * distance
     state[0] *= np.float32(1) - opacity
 
