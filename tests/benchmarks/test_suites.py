@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dnerf.benchmarks import Settings, run_suite
-from dnerf.benchmarks.kernels import RESOLUTIONS, plain_grid_encode, plain_packed_weights
+from dnerf.benchmarks.kernel_cases import RESOLUTIONS, plain_grid_encode, plain_packed_weights
 from dnerf.benchmarks.machine import Rates
 from dnerf.benchmarks.operations import OperationCounter
 from dnerf.benchmarks.quadrature import samples_needed
