@@ -36,6 +36,8 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
     Raises:
         ValueError: naming the argument and its value.
     """
+    if isinstance(value, str):
+        raise ValueError(f"{name} must be a number, got {value!r}")
     if not (value > 0 or (allow_zero and value == 0)) or value == float("inf"):
         bound = ">= 0" if allow_zero else "> 0"
         raise ValueError(f"{name} must be {bound} and finite, got {value}")

@@ -42,6 +42,11 @@ def test_numbers_that_are_not_positive_and_finite_are_refused(value: float) -> N
         check_positive("radius", value)
 
 
+def test_text_is_no_number() -> None:
+    with pytest.raises(ValueError, match="radius must be a number, got 'abc'"):
+        check_positive("radius", "abc")  # type: ignore[arg-type]
+
+
 def test_zero_is_allowed_where_asked_for() -> None:
     check_positive("weight", 0, allow_zero=True)
     check_positive("weight", 5e-324)
