@@ -93,9 +93,10 @@ class Workload:
         self.levels = GridLevels(RESOLUTIONS, MAX_ROWS)
         self.table = torch.randn(self.levels.num_rows, NUM_FEATURES, generator=generator).to(device)
         self.cells = self.positions * LATTICE
-        traced = self._middles(self._march(torch.zeros_like(self.jitter)))  # where `trace` looks
+        traced = self._middles(self._march(torch.zeros_like(self.jitter)))
+        self.traced_cells = (traced / 3 + 0.5) * LATTICE
         side = LATTICE // BRICK
-        needed = (torch.cat([self.cells, (traced / 3 + 0.5) * LATTICE]) / BRICK).long().clamp(0, side - 1)
+        needed = (torch.cat([self.cells, self.traced_cells]) / BRICK).long().clamp(0, side - 1)
         self.slots = torch.full((side,) * 3, -1, device=device)
         self.slots[needed.unbind(-1)] = 0
         places = (self.slots == 0).nonzero()
@@ -121,9 +122,10 @@ class Workload:
             aabb=self.box, step=STEP, skips=self.skips,
         )  # fmt: skip
 
-    def _used_vertices(self) -> int:
-        """Vertices of the bricks' lattice that the samples' cells have."""
-        x, y, z = (self.cells.long()[:, None] + cube_corners(self.cells.device)).unbind(-1)
+    @staticmethod
+    def _num_vertices(cells: Tensor) -> int:
+        """Vertices of the bricks' lattice that the cells (N, 3) of places in it have."""
+        x, y, z = (cells.long()[:, None] + cube_corners(cells.device)).unbind(-1)
         return int(torch.unique((x * (LATTICE + 1) + y) * (LATTICE + 1) + z).numel())
 
     def cases(self) -> list[Case]:
@@ -146,7 +148,7 @@ class Workload:
                 "brick_lookup",
                 "forward",
                 _backends(lambda: brick_lookup(self.cells, self.slots, self.bricks)),
-                (4 * (3 + CONTENTS) + 1) * self.num_samples + 4 * CONTENTS * self._used_vertices(),
+                (4 * (3 + CONTENTS) + 1) * self.num_samples + 4 * CONTENTS * self._num_vertices(self.cells),
             ),
             *_both(
                 "grid_encode",
@@ -174,7 +176,7 @@ class Workload:
 
     def _compiled_on_cpus_alone(self) -> list[Case]:
         """Kernels that GPUs run by their definition."""
-        n, contents = 4 * self.num_samples, 4 * CONTENTS * self._used_vertices()
+        n, contents = 4 * self.num_samples, 4 * CONTENTS * self._num_vertices(self.traced_cells)
         times = self.rays.times[self.marched.ray_indices]
         layers = sum(x.nbytes for x in self.layers) // 2
         activations = self.num_samples * (2 * WIDTHS[0] + 2 * WIDTHS[-1])
@@ -197,7 +199,7 @@ class Workload:
         ]
 
     def _tracer(self) -> Call:
-        """Following the rays through the bricks, with displacements of zero and steps that stay whole."""
+        """Following the rays through all their bricks: matter is thin, displacements are zero and steps stay whole."""
         side = DISPLACEMENTS + 1
         low, sides = self.box[0], self.box[1] - self.box[0]
         tables = FrameTables(
@@ -210,7 +212,7 @@ class Workload:
         numbers, r = torch.zeros(len(self.rays), dtype=torch.int64), self.rays
         return lambda: trace(
             r.origins, r.directions, r.near, r.far, states, numbers, tables, step=STEP, splits=1, min_weight=0.0,
-            split_weight=0.0, cells_per_unit=LATTICE / float(sides[0]), log_shift=0.0, stop_transmittance=1e-4,
+            split_weight=0.0, cells_per_unit=LATTICE / float(sides[0]), log_shift=-10.0, stop_transmittance=1e-4,
         )  # fmt: skip
 
 

@@ -122,7 +122,8 @@ class FrozenDeformation(Deformation):
             firsts.append(place[:-1].floor().clamp(min=0).long()[cell])
             lasts.append(place[1:].ceil().clamp(max=cells).long()[cell])
         first, last = torch.stack(firsts), torch.stack(lasts)
-        first, last = (x[:, (first <= last).all(0)] for x in (first, last))
+        is_inside = (first <= last).all(0)
+        first, last = first[:, is_inside], last[:, is_inside]
         around = torch.zeros_like(self.is_known)
         if first.shape[1]:
             _, rows, columns = around.shape
