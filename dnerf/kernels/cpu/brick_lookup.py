@@ -1,7 +1,7 @@
 # mypy: disable-error-code="call-arg,var-annotated"
 """numba version of `brick_lookup`.
 
-`trace` uses some of these functions; numba's cache on disk does not notice a change here: touch that file as well.
+`trace` uses some of these functions; numba's cache on disk does not notice a change here: delete __pycache__ then.
 """
 
 from typing import Any

@@ -1,7 +1,7 @@
 # mypy: disable-error-code="call-arg,var-annotated"
 """Which intervals of a ray are kept, for the numba versions of `march` and `trace`.
 
-numba's cache on disk does not notice a change here: touch those two as well.
+numba's cache on disk does not notice a change here: delete __pycache__ then.
 """
 
 import math

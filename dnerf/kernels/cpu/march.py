@@ -1,7 +1,7 @@
 # mypy: disable-error-code="call-arg,var-annotated"
 """numba version of `march`.
 
-Where a ray goes is `course`'s; numba's cache on disk does not notice a change there: touch this file as well.
+Where a ray goes is `course`'s; numba's cache on disk does not notice a change there: delete __pycache__ then.
 """
 
 from typing import Any
