@@ -7,7 +7,6 @@ from dnerf.geometry import cube_corners
 
 from .backend import choose, run_compiled
 
-# numba's cache on disk does not notice a change of these: delete __pycache__ in `cpu`.
 BRICK_BITS = 3
 BRICK = 1 << BRICK_BITS
 VERTICES = (BRICK + 1) ** 3

@@ -6,7 +6,6 @@ from torch.nn import functional
 
 from .backend import choose, run_compiled
 
-# numba's cache on disk does not notice a change of these: delete __pycache__ in `cpu`.
 BLOCK_BITS = 3
 BLOCK = 1 << BLOCK_BITS
 MAX_DISTANCE = 255

@@ -6,7 +6,6 @@ from torch import Tensor
 from .backend import choose, run_compiled
 
 # Least cosine between steps along one line: what rounding leaves of steps of 1e-4 units, one unit from the origin.
-# numba's cache on disk does not notice a change: delete __pycache__ in `cpu`.
 STRAIGHT = 1 - 1e-5
 
 

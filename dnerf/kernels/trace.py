@@ -13,7 +13,6 @@ from .grid_encode import GridLevels, grid_encode_reference
 from .march import kept_intervals
 from .skip_distances import blocks_shape
 
-# numba's cache on disk does not notice a change of these: delete __pycache__ in `cpu`.
 DONE, ELSEWHERE = -1, -2
 LACKS_VERTEX, LACKS_BRICK = 1, 2
 LOOK_AHEAD = 8  # kept intervals of a waiting ray whose vertices are asked for at once

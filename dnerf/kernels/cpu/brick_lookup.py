@@ -1,8 +1,5 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""numba version of `brick_lookup`.
-
-`trace` uses some of these functions; numba's cache on disk does not notice a change here: delete __pycache__ then.
-"""
+"""numba version of `brick_lookup`; `trace` uses some of its functions."""
 
 from typing import Any
 
@@ -12,7 +9,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..brick_lookup import BRICK, BRICK_BITS, VERTICES
-from .launch import BORROWS, FAST, launch
+from .launch import BORROWS, FAST, kernel, launch
 from .rows import blend_rows
 
 SIDE = BRICK + 1
@@ -66,7 +63,7 @@ def corner_weights(u: Any, v: Any, w: Any) -> Any:
     return e * (one - w), e * w, f * (one - w), f * w, g * (one - w), g * w, h * (one - w), h * w
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _lookup(positions: Any, slots: Any, table: Any, values: Any, known: Any, lanes: Any) -> None:
     for i in prange(positions.shape[0]):
         px, py, pz = positions[i]

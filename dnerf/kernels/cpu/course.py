@@ -1,8 +1,5 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""Which intervals of a ray are kept, for the numba versions of `march` and `trace`.
-
-numba's cache on disk does not notice a change here: delete __pycache__ then.
-"""
+"""Which intervals of a ray are kept, for the numba versions of `march` and `trace`."""
 
 import math
 from typing import Any
@@ -11,7 +8,7 @@ import numpy as np
 from numba import njit, prange
 
 from ..skip_distances import BLOCK_BITS
-from .launch import BORROWS
+from .launch import BORROWS, kernel
 
 TESTED_AT_ONCE = 32  # intervals of a ray, by vector instructions; few rays want fewer
 RAYS_AT_ONCE = 64  # neighbours, dealt out to threads in turn: matter fills the middle of a picture
@@ -24,7 +21,7 @@ def cells_of_workers(num_workers: int) -> np.ndarray:
 
 
 # No fast-math in this file: intervals and cells must round like those of the definition.
-@njit(parallel=True, cache=True, nogil=True, **BORROWS)
+@kernel(**BORROWS)
 def ray_ranges(
     origins: Any,
     directions: Any,
@@ -66,7 +63,7 @@ def interval(near: Any, jitter: Any, step: Any, enter: Any, leave: Any, index: A
     return max(start, enter), min(end, leave)
 
 
-@njit(parallel=True, cache=True, nogil=True, **BORROWS)
+@kernel(**BORROWS)
 def block_bounds(skips: Any, bounds: Any) -> None:
     """Per slab and axis: the first block with an occupied cell and the one after the last; empty where none is."""
     nk, bx, by, bz = skips.shape

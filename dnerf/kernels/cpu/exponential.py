@@ -2,7 +2,7 @@
 """Exponentials in single precision as part of a loop: calls of the C library's make it put its registers aside.
 
 Source: Cephes' expf (Moshier): x = n ln 2 + r, e^x = 2^n (1 + r + r^2 P(r)); within 2 units in the last place. NaN
-stays NaN. numba's cache on disk does not notice a change here: delete __pycache__ then.
+stays NaN.
 """
 
 from typing import Any

@@ -1,8 +1,5 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""What a frame's tables hold at a distance along a ray, for the numba version of `trace`.
-
-numba's cache on disk does not notice a change here: delete __pycache__ then.
-"""
+"""What a frame's tables hold at a distance along a ray, for the numba version of `trace`."""
 
 import math
 from typing import Any

@@ -1,8 +1,5 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""numba versions of `grid_encode` and its gradients.
-
-`trace` uses some of these functions; numba's cache on disk does not notice a change here: delete __pycache__ then.
-"""
+"""numba versions of `grid_encode` and its gradients."""
 
 from functools import lru_cache
 from typing import Any
@@ -13,7 +10,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..grid_encode import GridLevels
-from .launch import BORROWS, FAST, launch, num_threads
+from .launch import BORROWS, FAST, kernel, launch, num_threads
 from .rows import add_to_row, blend_rows, dot_slopes
 
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
@@ -111,7 +108,7 @@ def trilinear_weights(u: Any, v: Any, w: Any) -> Any:
     return (one - u) * a, u * a, (one - u) * b, u * b, (one - u) * c, u * c, (one - u) * d, u * d
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _forward(positions: Any, table: Any, levels: Any, out: Any, lanes: Any) -> None:
     for i in prange(positions.shape[0]):
         for j in range(levels.shape[0]):
@@ -123,7 +120,7 @@ def _forward(positions: Any, table: Any, levels: Any, out: Any, lanes: Any) -> N
             blend_rows(table, _rows(x, y, z, level), trilinear_weights(u, v, w), out, start, lanes)
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _grad_table(grad: Any, positions: Any, levels: Any, part_bits: int, num_workers: int, out: Any, lanes: Any) -> None:
     """Scatter-add without atomics: a task owns one level, or every 2^part_bits-th block of its rows.
 
@@ -147,7 +144,7 @@ def _grad_table(grad: Any, positions: Any, levels: Any, part_bits: int, num_work
                         add_to_row(out, rows[k], weights[k], grad, start, lanes)
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _grad_positions(grad: Any, positions: Any, table: Any, levels: Any, out: Any, lanes: Any) -> None:
     one, zero = positions.dtype.type(1), positions.dtype.type(0)
     for i in prange(positions.shape[0]):

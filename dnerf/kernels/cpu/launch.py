@@ -1,11 +1,13 @@
 # mypy: disable-error-code="attr-defined"
-"""Starting numba kernels on as many threads as torch uses."""
+"""Compiling numba kernels, and starting them on as many threads as torch uses."""
 
+import hashlib
 import os
 import threading
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -24,6 +26,37 @@ FAST = {"contract", "nsz"}
 # the call. Functions that only look at arrays which somebody else holds, and make or return none, do without. Divisions
 # by zero are infinite or NaN in them, as in the bodies of parallel loops.
 BORROWS: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
+
+
+def kernel(parallel: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorates a function that Python starts: compiled without the interpreter's lock and kept on disk.
+
+    numba takes what it kept as long as the file that a kernel stands in has not changed. Kernels are made of functions
+    and constants from other files too, so each state of all of them has a folder of its own.
+    """
+
+    def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+        before = numba.config.CACHE_DIR
+        numba.config.CACHE_DIR = str(_cache_folder())
+        try:
+            return numba.njit(parallel=parallel, cache=True, nogil=True, **options)(function)
+        finally:
+            numba.config.CACHE_DIR = before
+
+    return compiled
+
+
+@cache
+def _cache_folder() -> Path:
+    """In $NUMBA_CACHE_DIR; without it beside this file, or where that cannot be written, among the user's caches."""
+    here = Path(__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(here.parent.rglob("*.py")):
+        digest.update(f"{path.relative_to(here.parent)}\n".encode() + path.read_bytes())
+    beside = here / "__pycache__"
+    writable = os.access(beside if beside.exists() else here, os.W_OK)
+    users = Path(os.path.expanduser("~"), ".cache", "dnerf")
+    return Path(numba.config.CACHE_DIR or (beside if writable else users)) / f"kernels-{digest.hexdigest()[:16]}"
 
 
 def num_threads() -> int:

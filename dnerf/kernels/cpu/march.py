@@ -1,14 +1,11 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""numba version of `march`.
-
-Where a ray goes is `course`'s; numba's cache on disk does not notice a change there: delete __pycache__ then.
-"""
+"""numba version of `march`: where a ray goes is `course`'s."""
 
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from .course import (
@@ -21,7 +18,7 @@ from .course import (
     next_kept,
     ray_ranges,
 )
-from .launch import BORROWS, launch, num_threads
+from .launch import BORROWS, kernel, launch, num_threads
 from .rows import trailing_zeros
 from .skip_distances import skip_distances
 
@@ -70,7 +67,7 @@ def march(
 
 
 # No fast-math in this file: intervals must round like those of the definition.
-@njit(parallel=True, cache=True, nogil=True, **BORROWS)
+@kernel(**BORROWS)
 def _mark(
     origins: Any,
     directions: Any,
@@ -120,7 +117,7 @@ def _mark(
                 offsets[r + 1] = found
 
 
-@njit(parallel=True, cache=True, nogil=True, **BORROWS)
+@kernel(**BORROWS)
 def _fill(
     near: Any,
     jitter: Any,

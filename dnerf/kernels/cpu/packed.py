@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
-from .launch import BORROWS, FAST, launch
+from .launch import BORROWS, FAST, kernel, launch
 
 
 def weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ def _checked(offsets: Tensor, num_samples: int) -> np.ndarray:
     return array
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _log_transmittance(optical_depth: Any, offsets: Any, out: Any) -> None:
     for r in prange(len(offsets) - 1):
         before = 0.0
@@ -76,7 +76,7 @@ def _log_transmittance(optical_depth: Any, offsets: Any, out: Any) -> None:
             before += optical_depth[i]
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _grad_optical_depth(grad: Any, optical_depth: Any, weights: Any, offsets: Any, out: Any) -> None:
     """dL/dtau_j = g_j exp(-sum_{i<=j} tau_i) - sum_{i>j} g_i w_i."""
     dtype = optical_depth.dtype.type
@@ -91,7 +91,7 @@ def _grad_optical_depth(grad: Any, optical_depth: Any, weights: Any, offsets: An
             behind += grad[i] * weights[i]
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _sums(values: Any, weights: Any, offsets: Any, out: Any) -> None:
     for r in prange(len(offsets) - 1):
         for c in range(values.shape[1]):
@@ -101,7 +101,7 @@ def _sums(values: Any, weights: Any, offsets: Any, out: Any) -> None:
             out[r, c] = total
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _grad_values(grad: Any, weights: Any, offsets: Any, out: Any) -> None:
     for r in prange(len(offsets) - 1):
         for i in range(offsets[r], offsets[r + 1]):
@@ -109,7 +109,7 @@ def _grad_values(grad: Any, weights: Any, offsets: Any, out: Any) -> None:
                 out[i, c] = grad[r, c] if weights is None else weights[i] * grad[r, c]
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath=FAST, **BORROWS)
+@kernel(fastmath=FAST, **BORROWS)
 def _grad_weights(grad: Any, values: Any, offsets: Any, out: Any) -> None:
     for r in prange(len(offsets) - 1):
         for i in range(offsets[r], offsets[r + 1]):

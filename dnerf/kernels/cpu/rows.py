@@ -3,8 +3,6 @@
 numba's loop over a row's few features neither unrolls nor vectorises well, since LLVM must assume that the arrays
 overlap. These intrinsics emit one vector operation per row; its width is the length of the tuple `lanes`, which
 makes it a compile-time constant.
-
-numba's cache on disk watches only the file that a kernel stands in: after a change here, delete __pycache__ then.
 """
 
 from typing import Any

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from ..skip_distances import BLOCK_BITS, MAX_DISTANCE, blocks_shape
-from .launch import launch
+from .launch import kernel, launch
 
 
 def skip_distances(occupancy: Tensor) -> Tensor:
@@ -19,7 +19,7 @@ def skip_distances(occupancy: Tensor) -> Tensor:
     return out
 
 
-@njit(parallel=True, cache=True, nogil=True)
+@kernel()
 def _any(cells: Any, out: Any) -> None:
     """0 for a block with an occupied cell, the largest distance for the others."""
     nk, bx, by, bz = out.shape
@@ -38,7 +38,7 @@ def _any(cells: Any, out: Any) -> None:
                 out[k, x, y, z] = 0 if occupied else MAX_DISTANCE
 
 
-@njit(parallel=True, cache=True, nogil=True)
+@kernel()
 def _distances(out: Any) -> None:
     """Chebyshev distances by two raster sweeps (Rosenfeld and Pfaltz 1966), exact with all 26 neighbours."""
     nk, bx, by, bz = out.shape

@@ -9,7 +9,7 @@ from numba import njit
 from torch import Tensor
 
 from ..thin_out import STRAIGHT
-from .launch import BORROWS
+from .launch import BORROWS, kernel
 
 
 def thin_out(points: Tensor, times: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -21,7 +21,7 @@ def thin_out(points: Tensor, times: Tensor, spacing: float) -> tuple[Tensor, Ten
 
 
 # One thread: starting a second one takes as long as half of this.
-@njit(cache=True, nogil=True, **BORROWS)
+@kernel(parallel=False, **BORROWS)
 def _thin_out(points: Any, times: Any, spacing: float, chosen: Any, before: Any, fractions: Any) -> int:
     """How many points were chosen; the arrays are filled."""
     num_points, count = len(points), 0

@@ -24,7 +24,7 @@ from .course import (
 )
 from .exponential import sigmoid
 from .frame_lookup import FOUR, GOES_ON, brick_at, find, log_density_at, opacity_of, place_at, sum_of_terms
-from .launch import BORROWS, launch, num_threads
+from .launch import BORROWS, kernel, launch, num_threads
 from .rows import trailing_zeros
 
 SAMPLES_AT_ONCE = 8  # of a ray: while one is waiting for memory, the others are
@@ -88,7 +88,7 @@ def _scratch(num_workers: int, size: int, num_contents: int) -> tuple[np.ndarray
 
 
 # No fast-math: intervals and cells must round like those of the definition.
-@njit(parallel=True, cache=True, nogil=True, **BORROWS)
+@kernel(**BORROWS)
 def _trace(
     rays: Any,
     grid: Any,
