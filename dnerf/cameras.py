@@ -156,32 +156,27 @@ class Camera:
         rows = center_y - offset - y / depth * camera.focal_y
         return torch.stack([columns, rows], dim=-1), depth
 
-    def pixels_around(self, groups: Tensor) -> Tensor | None:
-        """Pixels inside the rectangles that groups of points span on the picture.
+    def rectangles_around(self, groups: Tensor) -> tuple[Tensor, Tensor] | None:
+        """The rectangles of pixels that groups of points span on the picture.
 
-        The rays that hit the convex hull of a group are among them.
+        The rays that hit the convex hull of a group go through its rectangle.
 
         Args:
             groups: (M, K, 3) world positions.
 
         Returns:
-            Pixel numbers (P,) int64, `row * width + column`, in order; None if a point does not lie before the camera.
+            First row and column of each, (2, M) int64, and the row and column behind it, (2, M); None if a point does
+            not lie before the camera.
         """
         # One group after the other in memory: reductions over short last axes are slow.
         positions, depth = self.project(groups.transpose(0, 1).contiguous())
         if not bool((depth > 0).all() & positions.isfinite().all()):
             return None
-        width, height = self.intrinsics.width, self.intrinsics.height
-        size = torch.tensor([width, height], device=positions.device, dtype=positions.dtype)
-        low = torch.minimum(positions.amin(0).floor().clamp(min=0), size).long()
-        high = torch.minimum(positions.amax(0).ceil().clamp(min=-1) + 1, size).long()
-        # How many rectangles hold a pixel is the sum of +1 and -1 at corners, over all that is above and to its left.
-        changes = torch.zeros(height + 1, width + 1, device=positions.device)
-        one = torch.ones((), device=positions.device)
-        for rows, columns, sign in ((low, low, one), (high, low, -one), (low, high, -one), (high, high, one)):
-            changes.index_put_((rows[:, 1], columns[:, 0]), sign, accumulate=True)
-        held = changes.cumsum(0).cumsum(1)[:height, :width] > 0.5
-        return held.reshape(-1).nonzero()[:, 0]
+        # Cut off while they are floats: what lies far beyond the picture may have no number.
+        most = positions.new_tensor([self.intrinsics.width, self.intrinsics.height])
+        low = torch.minimum(positions.amin(0).floor().clamp(min=0), most).long()
+        end = torch.minimum(positions.amax(0).ceil().clamp(min=-1) + 1, most).long()
+        return low.T.flip(0), end.T.flip(0)
 
     def rays(self, time: float, pixels: Tensor | None = None) -> Rays:
         """Rays of pixels at one time.

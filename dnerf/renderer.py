@@ -13,6 +13,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.compositing import FieldOutput, Rendering, composite, safe_divide
 from dnerf.fields.base import RadianceField
+from dnerf.kernels import few_nonzero
 from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
@@ -112,12 +113,14 @@ class Renderer(nn.Module):
         """
         numbers = torch.arange(len(rays), device=rays.near.device)
         sums = rays.origins.new_zeros(len(rays), 5)
-        source = self._marched(rays) if self._ends_early else None
-        refines = source is not None
-        if source is not None and tracer is not None:
+        if tracer is not None:
             with self.autocast(rays.origins.device):
                 sums, is_done = tracer(rays)
-            numbers = (~is_done).nonzero()[:, 0]
+            numbers = few_nonzero(~is_done)
+            if not len(numbers):
+                return self._shown(rays, sums)
+        source = self._marched(rays) if self._ends_early else None
+        refines = source is not None
         if source is None:
             with self.autocast(rays.origins.device):
                 samples = self.sampler(rays, field)
@@ -140,6 +143,10 @@ class Renderer(nn.Module):
             return 1 - seen.opacity
 
         walk_front_to_back(source, numbers, self.stop_transmittance, visit)
+        return self._shown(rays, sums)
+
+    def _shown(self, rays: Rays, sums: Tensor) -> Rendering:
+        """What rays show that meet rgb, depth times opacity, and opacity, (R, 5), before the background."""
         rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
         rgb = rgb + (1 - opacity)[:, None] * self.background(rays.directions)
         return Rendering(rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity))

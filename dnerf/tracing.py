@@ -6,11 +6,10 @@ from torch import Tensor
 from dnerf.deformations.frame_lattice import FrozenDeformation
 from dnerf.fields import DeformedField, RadianceField
 from dnerf.fields.baked import BakedField
-from dnerf.kernels import FrameTables, MarchGrid, trace
+from dnerf.kernels import FrameTables, MarchGrid, few_nonzero, trace
 from dnerf.kernels.backend import choose
 from dnerf.kernels.trace import DONE, NUM_STATES
 from dnerf.rays import Rays
-from dnerf.sparse import few_nonzero
 
 VERTICES_PER_RAY = 4  # most to ask around all occupied cells, instead of finding out which of them rays want
 PIONEERS = 5  # one ray of so many is sent ahead once, to find what most of its neighbours will want

@@ -17,7 +17,6 @@ FLOORS = {
     "geometry": 0,
     "provenance": 0,
     "rays": 0,
-    "sparse": 0,
     "stopping": 0,
     # 1: one ray at a time.
     "backgrounds": 1,

@@ -1,15 +1,15 @@
 """A deformation at one time, kept on a lattice: what a whole frame needs of it is computed once."""
 
 from collections.abc import Sequence
-from itertools import product
 
 import torch
 from torch import Tensor
 
 from dnerf.checks import as_box, check_positive
 from dnerf.deformations.base import Deformation, check_positions_times
-from dnerf.kernels import GridLevels, grid_encode
-from dnerf.sparse import few_nonzero
+from dnerf.kernels import GridLevels, covered_places, few_nonzero, grid_encode
+
+LEAST_ROWS = 256  # fewer take matrix libraries as long
 
 
 class FrameLattice:
@@ -48,8 +48,8 @@ class FrozenDeformation(Deformation):
         deformation: what is asked at vertices.
         lattice: where they are.
         time: in [0, 1]; the only one at which it may be called.
-        pad_to: the number of vertices asked is rounded up to a multiple of this, since matrix libraries compile code
-            for every new number of rows.
+        pad_to: the number of vertices asked is rounded up to a multiple of this, or to a power of two below it, since
+            matrix libraries compile code for every new number of rows.
     """
 
     def __init__(self, deformation: Deformation, lattice: FrameLattice, time: float, *, pad_to: int = 2048) -> None:
@@ -114,26 +114,21 @@ class FrozenDeformation(Deformation):
             occupied: (Gx, Gy, Gz) bool, which of the other grid's.
             aabb: (2, 3) box that the other grid fills, in world units.
         """
-        firsts, lasts = [], []
+        firsts, ends = [], []
         for axis, cell in enumerate(torch.unravel_index(few_nonzero(occupied), occupied.shape)):
             size, cells = occupied.shape[axis], self.levels.cells[axis]
             faces = torch.lerp(aabb[0, axis], aabb[1, axis], torch.linspace(0, 1, size + 1, device=aabb.device))
             place = (faces - self.low[axis]) / self.sides[axis] * cells
-            firsts.append(place[:-1].floor().clamp(min=0).long()[cell])
-            lasts.append(place[1:].ceil().clamp(max=cells).long()[cell])
-        first, last = torch.stack(firsts), torch.stack(lasts)
-        is_inside = (first <= last).all(0)
-        first, last = first[:, is_inside], last[:, is_inside]
-        around = torch.zeros_like(self.is_known)
-        if first.shape[1]:
-            _, rows, columns = around.shape
-            parts = [
-                [torch.minimum(a + k, b) * stride for k in range(int((b - a).amax()) + 1)]
-                for a, b, stride in zip(first, last, (1, columns, rows * columns), strict=True)
-            ]
-            for x, y, z in product(*parts):
-                around.view(-1).index_fill_(0, x + y + z, True)
-        return few_nonzero(around & ~self.is_known)
+            firsts.append(place[:-1].floor().long()[cell])
+            ends.append(place[1:].ceil().long()[cell] + 1)
+        around = covered_places(torch.stack(firsts[::-1]), torch.stack(ends[::-1]), self.is_known.shape)
+        return around[~self.is_known.view(-1)[around]]
+
+    def _padded(self, count: int) -> int:
+        """A multiple of `pad_to`; below it a power of two, so that a few vertices cost no more than some."""
+        if count > self.pad_to:
+            return count + -count % self.pad_to
+        return min(self.pad_to, max(LEAST_ROWS, 1 << (count - 1).bit_length()))
 
     @torch.no_grad()
     def fill(self, places: Tensor) -> bool:
@@ -144,7 +139,7 @@ class FrozenDeformation(Deformation):
         """
         if not len(places):
             return False
-        padded = torch.cat([places, places[-1:].expand(-len(places) % self.pad_to)])
+        padded = torch.cat([places, places[-1:].expand(self._padded(len(places)) - len(places))])
         columns = []
         for axis, place in enumerate(reversed(torch.unravel_index(padded, self.is_known.shape))):
             cells = self.levels.cells[axis]

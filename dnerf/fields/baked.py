@@ -16,6 +16,7 @@ from dnerf.kernels.brick_lookup import BRICK, VERTICES
 
 logger = logging.getLogger(__name__)
 
+MOST = torch.finfo(torch.float16).max
 CHUNK = 32  # bricks asked at a time, always as many: matrix libraries compile code for every new number of rows
 
 
@@ -25,14 +26,15 @@ class Baking:
     Every frame of a sequence looks at the same canonical matter. The field's contents at the vertices of a fine
     lattice, interpolated linearly, cost one lookup; a multi-resolution grid costs one per level, and a network.
     Vertices are computed when a sample first falls near them, brick by brick, so that only what is looked at exists.
-    The field is exact at vertices, and the error falls with the square of the cells' size where it is smooth.
+    The field is exact at vertices, as far as half precision goes, and the error falls with the square of the cells'
+    size where it is smooth.
 
     Args:
         box: (2, 3) corners of the space that the lattice covers, in world units; outside its bricks, which are whole,
             the field itself is asked.
         resolution: cells along the box's longest side.
-        max_bricks: most bricks of 8 x 8 x 8 cells that are kept, of 2.9 KiB for each number of a field's contents (46
-            KiB each and 364 MiB in all for 16); where there is no room for more, the field itself is asked.
+        max_bricks: most bricks of 8 x 8 x 8 cells that are kept, of 1.4 KiB for each number of a field's contents (23
+            KiB each and 182 MiB in all for 16); where there is no room for more, the field itself is asked.
 
     Raises:
         ValueError: for a box that is none, or numbers that are not positive.
@@ -81,7 +83,7 @@ class BakedField(RadianceField):
         self.num_bricks = 0
         self.is_full = False
         self.slots = torch.full(baking.shape, -1)  # per brick of the box: its number, -1 if it does not exist
-        self.bricks = torch.zeros(0, VERTICES, field.num_contents)  # at its vertices
+        self.bricks = torch.zeros(0, VERTICES, field.num_contents, dtype=torch.float16)  # at its vertices
 
     @property
     def num_contents(self) -> int:
@@ -112,7 +114,7 @@ class BakedField(RadianceField):
         """Interpolated contents (..., C) at positions (..., 3), in their dtype."""
         self.move_to(positions.device)
         points = positions.reshape(-1, 3)
-        cells = ((points - self.low.to(points.dtype)) * self.cells_per_unit).to(self.bricks.dtype)
+        cells = ((points - self.low.to(points.dtype)) * self.cells_per_unit).float()
         values, is_known = self._values(cells)
         values = values.to(points.dtype)
         if not bool(is_known.all()):
@@ -162,8 +164,8 @@ class BakedField(RadianceField):
         for part, number in zip((missing * BRICK).split(CHUNK), numbers.split(CHUNK), strict=True):
             asked = torch.cat([part, part[-1:].expand(CHUNK - len(part), 3)])
             points = self.low + (asked[:, None] + vertices).reshape(-1, 3) / self.cells_per_unit
-            values = self.field.contents(points).to(self.bricks.dtype).reshape(CHUNK, VERTICES, -1)
-            self.bricks[number] = values[: len(part)]
+            values = self.field.contents(points).clamp(-MOST, MOST).reshape(CHUNK, VERTICES, -1)
+            self.bricks[number] = values[: len(part)].to(self.bricks.dtype)
         self.slots[missing.unbind(-1)] = numbers
         self.num_bricks = end
         return True

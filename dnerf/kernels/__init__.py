@@ -2,6 +2,8 @@
 
 from .backend import BACKENDS, get_backend, set_backend, use_backend
 from .brick_lookup import brick_lookup
+from .covered_places import covered_places
+from .few_nonzero import few_nonzero
 from .grid_encode import GridLevels, grid_encode
 from .march import MarchedSamples, MarchGrid, march
 from .packed_sum import packed_sum
@@ -18,6 +20,8 @@ __all__ = [
     "MarchGrid",
     "MarchedSamples",
     "brick_lookup",
+    "covered_places",
+    "few_nonzero",
     "get_backend",
     "grid_encode",
     "march",

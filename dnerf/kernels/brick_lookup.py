@@ -22,11 +22,11 @@ def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tens
     Args:
         positions: (N, 3) in cells, from the lattice's low corner; on the face between two bricks the upper one counts.
         slots: (Bx, By, Bz) int64, number of the brick that is there, or -1.
-        bricks: (M, 729, F) values.
+        bricks: (M, 729, F) values, in single, double or half precision.
 
     Returns:
-        values (N, F) in the dtype of `bricks`, 0 where nothing is known, and whether they are known (N,) bool: the
-        position is inside the lattice and its brick exists.
+        values (N, F) in the dtype of `bricks`, or single precision for half, 0 where nothing is known, and whether
+        they are known (N,) bool: the position is inside the lattice and its brick exists.
 
     Raises:
         ValueError: a shape or dtype that does not fit.
@@ -37,7 +37,7 @@ def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tens
         raise ValueError(f"slots must be int64 of shape (Bx, By, Bz), got {slots.dtype} {tuple(slots.shape)}")
     if bricks.ndim != 3 or bricks.shape[1] != VERTICES:
         raise ValueError(f"bricks must have shape (M, {VERTICES}, F), got {tuple(bricks.shape)}")
-    positions = positions.to(bricks.dtype)
+    positions = positions.to(torch.promote_types(bricks.dtype, torch.float32))
     if choose(positions) == "reference":
         return brick_lookup_reference(positions, slots, bricks)
     return torch.ops.dnerf.brick_lookup(positions, slots, bricks)
@@ -46,7 +46,7 @@ def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tens
 def brick_lookup_reference(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tensor, Tensor]:
     """The definition of `brick_lookup` in plain torch."""
     if not len(bricks):
-        return bricks.new_zeros(len(positions), bricks.shape[2]), torch.zeros_like(positions[:, 0], dtype=torch.bool)
+        return positions.new_zeros(len(positions), bricks.shape[2]), torch.zeros_like(positions[:, 0], dtype=torch.bool)
     shape = torch.tensor(slots.shape, device=slots.device)
     inside = ((positions >= 0) & (positions <= shape * BRICK)).all(-1)
     safe = torch.where(inside[:, None], positions, 0)
@@ -70,4 +70,4 @@ def _brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Ten
 @_brick_lookup.register_fake
 def _(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tensor, Tensor]:
     count = positions.shape[0]
-    return bricks.new_empty(count, bricks.shape[2]), bricks.new_empty(count, dtype=torch.bool)
+    return positions.new_empty(count, bricks.shape[2]), positions.new_empty(count, dtype=torch.bool)

@@ -34,7 +34,8 @@ class FrameTables:
         low: (3,) lowest corner of that lattice, in world units.
         sides: (3,) of it.
         slots: (Bx, By, Bz) int64, see `brick_lookup`.
-        bricks: (M, 729, 4 K): a place's terms of the logarithm of density, then of red, green and blue.
+        bricks: (M, 729, 4 K), float32 or float16: a place's terms of the logarithm of density, then of red, green and
+            blue.
         brick_low: (3,) lowest corner of the bricks, in canonical space.
         waves: (K,) factors of the terms at this time.
 
@@ -76,9 +77,11 @@ class FrameTables:
                 raise ValueError(f"{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}")
         if self.slots.ndim != 3 or self.slots.dtype != torch.int64 or not self.slots.numel():
             raise ValueError(f"slots must be int64 of three axes, got {self.slots.dtype} {tuple(self.slots.shape)}")
-        for name in ("aabb", "displacements", "low", "sides", "bricks", "brick_low", "waves"):
+        for name in ("aabb", "displacements", "low", "sides", "brick_low", "waves"):
             if getattr(self, name).dtype != torch.float32:
                 raise ValueError(f"{name} must be float32, got {getattr(self, name).dtype}")
+        if self.bricks.dtype not in (torch.float32, torch.float16):
+            raise ValueError(f"bricks must be float32 or float16, got {self.bricks.dtype}")
 
     def tensors(self) -> list[Tensor]:
         """All of them, in the order of the arguments."""
@@ -120,7 +123,7 @@ def trace(
             ray has 1, 0, 0, 0, 0.
         numbers: (R,) int64, each ray's next interval, counted from its first possible one: 0 for a fresh ray, or what
             came back. Rays with negative numbers are left alone.
-        tables: the scene at the rays' time; float32 throughout.
+        tables: the scene at the rays' time.
         step: length of an interval, in world units.
         splits: parts of an interval.
         min_weight: see above; without effect if intervals are not split.

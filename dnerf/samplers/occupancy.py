@@ -10,11 +10,10 @@ from dnerf.checks import check_positive
 from dnerf.compositing import render_weights
 from dnerf.fields.base import RadianceField
 from dnerf.geometry import cube_corners
-from dnerf.kernels import MarchGrid, march
+from dnerf.kernels import MarchGrid, covered_places, few_nonzero, march
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.samplers.visibility import joined, visible_weights
-from dnerf.sparse import few_nonzero
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
@@ -205,7 +204,10 @@ class OccupancySampler(OccupancyGrid):
         occupied = self.grid_at(time, camera.pose.dtype).occupancy
         lowest = torch.stack(torch.unravel_index(few_nonzero(occupied), occupied.shape), dim=-1)
         unit = (lowest[:, None] + cube_corners(lowest.device)) / self.shape[1:]
-        return camera.pixels_around(torch.lerp(self.box[0], self.box[1], unit))
+        rectangles = camera.rectangles_around(torch.lerp(self.box[0], self.box[1], unit))
+        if rectangles is None:
+            return None
+        return covered_places(*rectangles, (camera.intrinsics.height, camera.intrinsics.width))
 
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
         asked, number = joined(samples, self.filter_joins if self.training_splits == 1 else 1)

@@ -69,18 +69,19 @@ def test_numba_equals_reference(shape, share, num_features, count, seed):
     torch.testing.assert_close(values, expected, rtol=0, atol=5e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
 @pytest.mark.parametrize("num_features", [1, 3, 4, 16])
 @pytest.mark.parametrize("count", [0, 1, 1000])
 def test_compiled_equals_reference(compiled, dtype, num_features, count):
     shape = (3, 1, 2)
     slots, bricks = lattice(shape, 4, num_features, dtype)
-    positions = places(count, shape, dtype=dtype)
+    real = torch.promote_types(dtype, torch.float32)
+    positions = places(count, shape, dtype=real)
     values, known = brick_lookup(positions.to(compiled), slots.to(compiled), bricks.to(compiled))
     expected, expected_known = brick_lookup_reference(positions, slots, bricks)
     assert torch.equal(known.cpu(), expected_known)
-    assert values.dtype == dtype
-    torch.testing.assert_close(values.cpu(), expected, rtol=0, atol=5e-6 if dtype == torch.float32 else 1e-13)
+    assert values.dtype == expected.dtype == real
+    torch.testing.assert_close(values.cpu(), expected, rtol=0, atol=5e-6 if real == torch.float32 else 1e-13)
 
 
 def test_what_is_no_place_is_not_known(compiled):

@@ -17,12 +17,17 @@ SIDE = BRICK + 1
 
 def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tensor, Tensor]:
     num_features = bricks.shape[2]
-    values = bricks.new_zeros(positions.shape[0], num_features)
+    values = positions.new_zeros(positions.shape[0], num_features)
     known = torch.zeros(positions.shape[0], dtype=torch.bool)
-    table = bricks.contiguous().view(-1, num_features)
-    arrays = (x.detach().contiguous().numpy() for x in (positions, slots, table))
-    launch(_lookup, *arrays, values.numpy(), known.numpy(), (0,) * num_features)
+    arrays = (x.detach().contiguous().numpy() for x in (positions, slots))
+    launch(_lookup, *arrays, rows_of(bricks), values.numpy(), known.numpy(), (0,) * num_features)
     return values, known
+
+
+def rows_of(bricks: Tensor) -> np.ndarray:
+    """Their vertices' values (M * 729, F), for `blend_rows`."""
+    rows = bricks.detach().contiguous().view(-1, bricks.shape[2])
+    return (rows.view(torch.uint16) if rows.dtype == torch.float16 else rows).numpy()
 
 
 @njit(fastmath=FAST, **BORROWS)

@@ -23,6 +23,10 @@ def _vector_pointer(context: Any, builder: Any, array_type: Any, array: Any, sta
 
 
 def _load(context: Any, builder: Any, array_type: Any, array: Any, start: Any, width: int) -> Any:
+    if array_type.dtype == types.uint16:  # half precision: numba has no such numbers, processors do
+        data = context.make_array(array_type)(context, builder, array).data
+        pointer = builder.bitcast(builder.gep(data, [start]), ir.VectorType(ir.HalfType(), width).as_pointer())
+        return builder.fpext(builder.load(pointer, align=2), ir.VectorType(ir.FloatType(), width))
     pointer = _vector_pointer(context, builder, array_type, array, start, width)
     return builder.load(pointer, align=array_type.dtype.bitwidth // 8)
 
@@ -36,7 +40,10 @@ def _splat(builder: Any, value: Any, width: int) -> Any:
 
 @intrinsic
 def blend_rows(typing: Any, table: Any, rows: Any, weights: Any, out: Any, start: Any, lanes: Any) -> tuple[Any, Any]:
-    """out.flat[start : start + F] = sum_k weights[k] * table[rows[k]], for tuples of rows and weights."""
+    """out.flat[start : start + F] = sum_k weights[k] * table[rows[k]], for tuples of rows and weights.
+
+    A table in half precision is given as uint16; weights and `out` are then in single precision.
+    """
     width = lanes.count
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -9,8 +9,9 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from ..brick_lookup import BRICK_BITS, VERTICES
+from ..brick_lookup import BRICK_BITS
 from ..trace import DONE, LACKS_BRICK, LACKS_VERTEX, LOOK_AHEAD
+from .brick_lookup import rows_of
 from .course import (
     LINE,
     RAYS_AT_ONCE,
@@ -45,18 +46,15 @@ def trace(
     reach = skips.contiguous().numpy()
     bounds = np.empty((1, 3, 2), np.int64)
     launch(block_bounds, reach[None], bounds)
-    table, known, low_, sides_, slots_, bricks_, brick_low_, waves_ = (
-        x.contiguous().numpy() for x in (displacements, is_known, low, sides, slots, bricks, brick_low, waves)
+    table, known, low_, sides_, slots_, brick_low_, waves_ = (
+        x.contiguous().numpy() for x in (displacements, is_known, low, sides, slots, brick_low, waves)
     )
     launch(
         _trace,
         (o, d, t0, ranges, counts),
         (occupancy.contiguous().view(-1).numpy(), tuple(occupancy.shape), reach, bounds[0], box, size),
         (table, known, low_, sides_),
-        (
-            slots_, bricks_.reshape(len(bricks) * VERTICES, bricks.shape[2]), brick_low_, np.float32(cells_per_unit),
-            waves_, np.float32(log_shift),
-        ),
+        (slots_, rows_of(bricks), brick_low_, np.float32(cells_per_unit), waves_, np.float32(log_shift)),
         (
             splits, np.float32(min_weight), np.float32(split_weight), np.float32(stop_transmittance),
             np.float32(_faint(min_weight, step)),

@@ -16,7 +16,7 @@ ROWS = tl.constexpr(VERTICES)
 
 def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tensor, Tensor]:
     count, num_features = positions.shape[0], bricks.shape[2]
-    values = bricks.new_empty(count, num_features)
+    values = positions.new_empty(count, num_features)
     known = torch.empty(count, dtype=torch.bool, device=bricks.device)
     if count:
         _lookup[(triton.cdiv(count, BLOCK),)](
@@ -70,7 +70,7 @@ def _lookup(
     is_known = in_x & in_y & in_z & (number >= 0)
     mask = valid[:, None] & is_known[:, None] & (features < num_features)[None, :]
     first = number * ROWS + (x % CELLS * SIDE + y % CELLS) * SIDE + z % CELLS
-    total = tl.zeros((block, width), bricks.dtype.element_ty)
+    total = tl.zeros((block, width), values.dtype.element_ty)
     for k in tl.static_range(8):
         weights = (u if k & 4 else 1 - u) * (v if k & 2 else 1 - v) * (w if k & 1 else 1 - w)
         rows = first + (k >> 2) * SIDE * SIDE + (k >> 1 & 1) * SIDE + (k & 1)
