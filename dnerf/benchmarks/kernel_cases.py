@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
 
+from dnerf.benchmarks.plain_kernels import corner_rows, plain_grid_encode, plain_packed_weights
 from dnerf.benchmarks.suite import Settings
 from dnerf.geometry import cube_corners
 from dnerf.kernels import (
@@ -15,6 +15,8 @@ from dnerf.kernels import (
     GridLevels,
     MarchedSamples,
     brick_lookup,
+    covered_places,
+    few_nonzero,
     grid_encode,
     march,
     packed_sum,
@@ -26,7 +28,6 @@ from dnerf.kernels import (
     use_backend,
 )
 from dnerf.kernels.brick_lookup import BRICK, VERTICES
-from dnerf.kernels.grid_encode import HASH_PRIMES
 from dnerf.kernels.trace import NUM_STATES
 from dnerf.rays import Rays
 
@@ -101,7 +102,7 @@ class Workload:
         self.slots[needed.unbind(-1)] = 0
         places = (self.slots == 0).nonzero()
         self.slots[places.unbind(-1)] = torch.arange(len(places), device=device)
-        self.bricks = torch.randn(len(places), VERTICES, CONTENTS, generator=generator).to(device)
+        self.bricks = torch.randn(len(places), VERTICES, CONTENTS, generator=generator).half().to(device)
         self.depth = torch.rand(self.num_samples, generator=generator).to(device)
         self.values = torch.rand(self.num_samples, 5, generator=generator).to(device)
         self.weights = packed_weights(self.depth, self.marched.offsets)
@@ -122,11 +123,11 @@ class Workload:
             aabb=self.box, step=STEP, skips=self.skips,
         )  # fmt: skip
 
-    @staticmethod
-    def _num_vertices(cells: Tensor) -> int:
-        """Vertices of the bricks' lattice that the cells (N, 3) of places in it have."""
+    def _contents_bytes(self, cells: Tensor) -> int:
+        """What the bricks hold at the vertices of the cells (N, 3) of places in them."""
         x, y, z = (cells.long()[:, None] + cube_corners(cells.device)).unbind(-1)
-        return int(torch.unique((x * (LATTICE + 1) + y) * (LATTICE + 1) + z).numel())
+        vertices = torch.unique((x * (LATTICE + 1) + y) * (LATTICE + 1) + z)
+        return self.bricks.element_size() * CONTENTS * vertices.numel()
 
     def cases(self) -> list[Case]:
         """All kernels, forward and (where there is one) backward."""
@@ -148,7 +149,7 @@ class Workload:
                 "brick_lookup",
                 "forward",
                 _backends(lambda: brick_lookup(self.cells, self.slots, self.bricks)),
-                (4 * (3 + CONTENTS) + 1) * self.num_samples + 4 * CONTENTS * self._num_vertices(self.cells),
+                (4 * (3 + CONTENTS) + 1) * self.num_samples + self._contents_bytes(self.cells),
             ),
             *_both(
                 "grid_encode",
@@ -176,7 +177,12 @@ class Workload:
 
     def _compiled_on_cpus_alone(self) -> list[Case]:
         """Kernels that GPUs run by their definition."""
-        n, contents = 4 * self.num_samples, 4 * CONTENTS * self._num_vertices(self.traced_cells)
+        n, contents = 4 * self.num_samples, self._contents_bytes(self.traced_cells)
+        occupied = self.occupancy[0]
+        cells = torch.stack(torch.unravel_index(few_nonzero(occupied), occupied.shape))
+        # Vertices of the displacements' lattice around them.
+        lows, ends = cells * DISPLACEMENTS // len(occupied), -(-(cells + 1) * DISPLACEMENTS // len(occupied)) + 1
+        around = covered_places(lows, ends, (DISPLACEMENTS + 1,) * 3)
         times = self.rays.times[self.marched.ray_indices]
         layers = sum(x.nbytes for x in self.layers) // 2
         activations = self.num_samples * (2 * WIDTHS[0] + 2 * WIDTHS[-1])
@@ -187,6 +193,18 @@ class Workload:
                 "forward",
                 _backends(lambda: skip_distances(self.occupancy)),
                 self.occupancy.nbytes + self.skips.nbytes,
+            ),
+            Case(
+                "few_nonzero",
+                "forward",
+                _backends(lambda: few_nonzero(occupied)) | {PLAIN: lambda: occupied.view(-1).nonzero()[:, 0]},
+                occupied.nbytes + 8 * cells.shape[1],
+            ),
+            Case(
+                "covered_places",
+                "forward",
+                _backends(lambda: covered_places(lows, ends, (DISPLACEMENTS + 1,) * 3)),
+                lows.nbytes + ends.nbytes + around.nbytes,
             ),
             Case("trace", "forward", _backends(self._tracer()), 10 * 4 * len(self.rays) + contents),
             *_both(
@@ -260,33 +278,3 @@ def _both(
         Case(kernel, name, _backends(way(function)) | ({} if plain is None else {PLAIN: way(plain)}), size)
         for name, way, size in ways
     ]
-
-
-def corner_rows(positions: Tensor, levels: GridLevels) -> list[tuple[Tensor, Tensor]]:
-    """Per level, the table rows (N, 8) of each position's cell and their trilinear weights (N, 8)."""
-    corners = torch.tensor([(k & 1, k >> 1 & 1, k >> 2) for k in range(8)], device=positions.device)
-    found = []
-    for rx, ry, rz, offset, mask in levels.describe():
-        cells = torch.tensor((rx, ry, rz), device=positions.device)
-        scaled = positions.clamp(0, 1) * cells
-        lower = scaled.detach().long().minimum(cells - 1)
-        fraction = (scaled - lower)[:, None]
-        weights = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
-        x, y, z = (lower[:, None] + corners).unbind(-1)
-        hashed = (x * HASH_PRIMES[0] ^ y * HASH_PRIMES[1] ^ z * HASH_PRIMES[2]) & mask
-        found.append((offset + (hashed if mask >= 0 else x + (rx + 1) * (y + (ry + 1) * z)), weights))
-    return found
-
-
-def plain_grid_encode(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:
-    """`grid_encode` as one `embedding_bag` over all levels: torch's own fused gather and weighted sum."""
-    rows, weights = (torch.stack(x, 1) for x in zip(*corner_rows(positions, levels)))
-    summed = embedding_bag(rows.reshape(-1, 8), table, mode="sum", per_sample_weights=weights.reshape(-1, 8))
-    return summed.reshape(len(positions), -1)
-
-
-def plain_packed_weights(optical_depth: Tensor, ray_indices: Tensor, offsets: Tensor) -> Tensor:
-    """`packed_weights` from one cumulative sum over all rays, in float64 since float32 loses all precision."""
-    total = torch.cat([optical_depth.new_zeros(1, dtype=torch.float64), optical_depth.double().cumsum(0)])
-    before = (total[:-1] - total[offsets[ray_indices]]).to(optical_depth.dtype)
-    return torch.exp(-before) * -torch.expm1(-optical_depth)

@@ -27,12 +27,12 @@ def run(settings: Settings) -> SuiteResult:
         title="Kernels: compiled, by definition, in plain torch, and the machine's limit",
         summary=(
             "Every kernel of `dnerf/kernels` is timed on the samples of rays through an occupied spherical shell, as a "
-            "training step of `experiment=fast` has them (`trace`: a frame; `skip_distances`: the whole grid, whatever "
-            "the samples): the compiled version (numba or oneDNN on the CPU, Triton on a GPU), the reference that "
-            "defines it, and the quickest form in plain torch that we know. Variants run in turn; medians with "
-            "quartiles. The limit is the least number of bytes (inputs, outputs and table rows in use, once each) at "
-            "the copy bandwidth measured in the same run; a gather from a table that fits into a cache reads each row "
-            "many times, so no program reaches it."
+            "training step of `experiment=fast` has them (`trace`: a frame; `skip_distances`, `few_nonzero` and "
+            "`covered_places`: a whole grid, whatever the samples): the compiled version (numba or oneDNN on the CPU, "
+            "Triton on a GPU), the reference that defines it, and the quickest form in plain torch that we know. "
+            "Variants run in turn; medians with quartiles. The limit is the least number of bytes (inputs, outputs and "
+            "table rows in use, once each) at the copy bandwidth measured in the same run; a gather from a table that "
+            "fits into a cache reads each row many times, so no program reaches it."
         ),
         tables=[
             Table("Times", rows, "times_compiled: how many times the compiled version's median; times_limit likewise."),

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from dnerf.benchmarks import Settings, run_suite
-from dnerf.benchmarks.kernel_cases import RESOLUTIONS, plain_grid_encode, plain_packed_weights
+from dnerf.benchmarks.kernel_cases import RESOLUTIONS
 from dnerf.benchmarks.machine import Rates
 from dnerf.benchmarks.operations import OperationCounter
+from dnerf.benchmarks.plain_kernels import plain_grid_encode, plain_packed_weights
 from dnerf.benchmarks.quadrature import samples_needed
 from dnerf.benchmarks.scaling import measure
 from dnerf.benchmarks.smooth import SmoothClouds, exact_smooth
