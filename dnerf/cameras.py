@@ -168,8 +168,7 @@ class Camera:
             First row and column of each, (2, M) int64, and the row and column behind it, (2, M); None if a point does
             not lie before the camera.
         """
-        # One group after the other in memory: reductions over short last axes are slow.
-        positions, depth = self.project(groups.transpose(0, 1).contiguous())
+        positions, depth = self.project(groups.transpose(0, 1))
         if not bool((depth > 0).all() & positions.isfinite().all()):
             return None
         # Cut off while they are floats: what lies far beyond the picture may have no number.

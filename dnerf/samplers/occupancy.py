@@ -202,9 +202,13 @@ class OccupancySampler(OccupancyGrid):
         rectangle around a cell's corners holds all of it.
         """
         occupied = self.grid_at(time, camera.pose.dtype).occupancy
-        lowest = torch.stack(torch.unravel_index(few_nonzero(occupied), occupied.shape), dim=-1)
-        unit = (lowest[:, None] + cube_corners(lowest.device)) / self.shape[1:]
-        rectangles = camera.rectangles_around(torch.lerp(self.box[0], self.box[1], unit))
+        corners = []
+        for axis, cell in enumerate(torch.unravel_index(few_nonzero(occupied), occupied.shape)):
+            unit = torch.linspace(0, 1, occupied.shape[axis] + 1, device=cell.device)
+            faces = torch.lerp(self.box[0, axis], self.box[1, axis], unit)
+            corners.append(faces[cell + cube_corners(cell.device)[:, axis, None]])
+        # In memory axis by axis, and corner by corner: what follows are operations on columns.
+        rectangles = camera.rectangles_around(torch.stack(corners).permute(2, 1, 0))
         if rectangles is None:
             return None
         return covered_places(*rectangles, (camera.intrinsics.height, camera.intrinsics.width))

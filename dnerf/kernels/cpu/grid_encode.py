@@ -12,10 +12,12 @@ from torch import Tensor
 from ..grid_encode import GridLevels
 from .launch import BORROWS, FAST, kernel, launch, num_threads
 from .rows import add_to_row, blend_rows, dot_slopes
+from .tasks import next_task, none_taken
 
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
 # A table gradient's rows are dealt out in blocks of 2^6: fine enough to balance crowded regions of a dense level.
 ROW_BLOCK_BITS = 6
+SAMPLES_AT_ONCE = 256  # dealt out to threads
 
 
 def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
@@ -27,6 +29,8 @@ def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -
         _array(table),
         _levels(tuple(cells), max_rows),
         out.numpy(),
+        num_threads(),
+        none_taken(),
         (0,) * num_features,
     )
     return out
@@ -37,7 +41,9 @@ def grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int],
     out = torch.zeros_like(table, memory_format=torch.contiguous_format)
     lanes = (0,) * table.shape[1]
     part_bits = max(0, (num_threads() - 1) // len(levels)).bit_length()
-    launch(_grad_table, _array(grad), _array(positions), levels, part_bits, num_threads(), out.numpy(), lanes)
+    launch(
+        _grad_table, _array(grad), _array(positions), levels, part_bits, out.numpy(), num_threads(), none_taken(), lanes
+    )
     return out
 
 
@@ -50,6 +56,8 @@ def grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[i
         _array(table),
         _levels(tuple(cells), max_rows),
         out.numpy(),
+        num_threads(),
+        none_taken(),
         (0,) * table.shape[1],
     )
     return out
@@ -109,27 +117,35 @@ def trilinear_weights(u: Any, v: Any, w: Any) -> Any:
 
 
 @kernel(fastmath=FAST, **BORROWS)
-def _forward(positions: Any, table: Any, levels: Any, out: Any, lanes: Any) -> None:
-    for i in prange(positions.shape[0]):
-        for j in range(levels.shape[0]):
-            level = levels[j]
-            x, u = locate(positions[i, 0], level[0])
-            y, v = locate(positions[i, 1], level[1])
-            z, w = locate(positions[i, 2], level[2])
-            start = i * out.shape[1] + j * len(lanes)
-            blend_rows(table, _rows(x, y, z, level), trilinear_weights(u, v, w), out, start, lanes)
+def _forward(positions: Any, table: Any, levels: Any, out: Any, num_workers: int, taken: Any, lanes: Any) -> None:
+    for _ in prange(num_workers):
+        first = next_task(taken) * SAMPLES_AT_ONCE
+        while first < positions.shape[0]:
+            for i in range(first, min(first + SAMPLES_AT_ONCE, positions.shape[0])):
+                for j in range(levels.shape[0]):
+                    level = levels[j]
+                    x, u = locate(positions[i, 0], level[0])
+                    y, v = locate(positions[i, 1], level[1])
+                    z, w = locate(positions[i, 2], level[2])
+                    start = i * out.shape[1] + j * len(lanes)
+                    blend_rows(table, _rows(x, y, z, level), trilinear_weights(u, v, w), out, start, lanes)
+            first = next_task(taken) * SAMPLES_AT_ONCE
 
 
 @kernel(fastmath=FAST, **BORROWS)
-def _grad_table(grad: Any, positions: Any, levels: Any, part_bits: int, num_workers: int, out: Any, lanes: Any) -> None:
+def _grad_table(
+    grad: Any, positions: Any, levels: Any, part_bits: int, out: Any, num_workers: int, taken: Any, lanes: Any
+) -> None:
     """Scatter-add without atomics: a task owns one level, or every 2^part_bits-th block of its rows.
 
-    Each row is added to by one thread, in the order of the samples: the result depends on no thread count.
+    Each row is added to by one thread, in the order of the samples: the result depends on no thread count. Fine levels
+    come first: their rows lie far apart, so they take longest.
     """
     num_tasks = levels.shape[0] << part_bits
     part_mask = (1 << part_bits) - 1
-    for worker in prange(num_workers):
-        for task in range(worker, num_tasks, num_workers):
+    for _ in prange(num_workers):
+        task = num_tasks - 1 - next_task(taken)
+        while task >= 0:
             level = levels[task >> part_bits]
             part = task & part_mask
             for i in range(positions.shape[0]):
@@ -142,24 +158,31 @@ def _grad_table(grad: Any, positions: Any, levels: Any, part_bits: int, num_work
                 for k in range(8):
                     if part_bits == 0 or (rows[k] >> ROW_BLOCK_BITS) & part_mask == part:
                         add_to_row(out, rows[k], weights[k], grad, start, lanes)
+            task = num_tasks - 1 - next_task(taken)
 
 
 @kernel(fastmath=FAST, **BORROWS)
-def _grad_positions(grad: Any, positions: Any, table: Any, levels: Any, out: Any, lanes: Any) -> None:
+def _grad_positions(
+    grad: Any, positions: Any, table: Any, levels: Any, out: Any, num_workers: int, taken: Any, lanes: Any
+) -> None:
     one, zero = positions.dtype.type(1), positions.dtype.type(0)
-    for i in prange(positions.shape[0]):
-        grad_x, grad_y, grad_z = zero, zero, zero
-        for j in range(levels.shape[0]):
-            level = levels[j]
-            x, u = locate(positions[i, 0], level[0])
-            y, v = locate(positions[i, 1], level[1])
-            z, w = locate(positions[i, 2], level[2])
-            rows = _rows(x, y, z, level)
-            start = i * grad.shape[1] + j * len(lanes)
-            along_x, along_y, along_z = dot_slopes(table, rows, (u, v, w), grad, start, lanes)
-            grad_x += along_x * positions.dtype.type(level[0])
-            grad_y += along_y * positions.dtype.type(level[1])
-            grad_z += along_z * positions.dtype.type(level[2])
-        out[i, 0] = grad_x if zero <= positions[i, 0] <= one else zero
-        out[i, 1] = grad_y if zero <= positions[i, 1] <= one else zero
-        out[i, 2] = grad_z if zero <= positions[i, 2] <= one else zero
+    for _ in prange(num_workers):
+        first = next_task(taken) * SAMPLES_AT_ONCE
+        while first < positions.shape[0]:
+            for i in range(first, min(first + SAMPLES_AT_ONCE, positions.shape[0])):
+                grad_x, grad_y, grad_z = zero, zero, zero
+                for j in range(levels.shape[0]):
+                    level = levels[j]
+                    x, u = locate(positions[i, 0], level[0])
+                    y, v = locate(positions[i, 1], level[1])
+                    z, w = locate(positions[i, 2], level[2])
+                    rows = _rows(x, y, z, level)
+                    start = i * grad.shape[1] + j * len(lanes)
+                    along_x, along_y, along_z = dot_slopes(table, rows, (u, v, w), grad, start, lanes)
+                    grad_x += along_x * positions.dtype.type(level[0])
+                    grad_y += along_y * positions.dtype.type(level[1])
+                    grad_z += along_z * positions.dtype.type(level[2])
+                out[i, 0] = grad_x if zero <= positions[i, 0] <= one else zero
+                out[i, 1] = grad_y if zero <= positions[i, 1] <= one else zero
+                out[i, 2] = grad_z if zero <= positions[i, 2] <= one else zero
+            first = next_task(taken) * SAMPLES_AT_ONCE

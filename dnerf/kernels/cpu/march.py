@@ -21,6 +21,7 @@ from .course import (
 from .launch import BORROWS, kernel, launch, num_threads
 from .rows import trailing_zeros
 from .skip_distances import skip_distances
+from .tasks import next_task, none_taken
 
 
 def march(
@@ -55,7 +56,7 @@ def march(
     launch(block_bounds, reach, bounds)
     slabs = grid.reshape(len(grid), -1)
     arguments = (o, d, t0, times_, jitter_, slabs, grid.shape[1:], reach, bounds, box, size, limit, ranges, counts)
-    launch(_mark, *arguments, kept, offsets.numpy(), cells_of_workers(num_threads()))
+    launch(_mark, *arguments, kept, offsets.numpy(), cells_of_workers(num_threads()), none_taken())
     torch.cumsum(offsets, 0, out=offsets)
 
     num_samples = int(offsets[-1])
@@ -86,6 +87,7 @@ def _mark(
     kept: Any,
     offsets: Any,
     cells: Any,
+    taken: Any,
 ) -> None:
     """Set a bit for every kept interval, and count them.
 
@@ -97,7 +99,8 @@ def _mark(
     num_workers = len(cells)
     num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
     for worker in prange(num_workers):
-        for group in range(worker, num_groups, num_workers):
+        group = next_task(taken)
+        while group < num_groups:
             for r in range(group * RAYS_AT_ONCE, min((group + 1) * RAYS_AT_ONCE, len(near))):
                 slab = min(max(int(times[r] * near.dtype.type(occupancy.shape[0])), 0), occupancy.shape[0] - 1)
                 j, count, course = course_of(
@@ -115,6 +118,7 @@ def _mark(
                         found += 1
                     j += TESTED_AT_ONCE
                 offsets[r + 1] = found
+            group = next_task(taken)
 
 
 @kernel(**BORROWS)

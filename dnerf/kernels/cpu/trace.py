@@ -27,6 +27,7 @@ from .exponential import sigmoid
 from .frame_lookup import FOUR, GOES_ON, brick_at, find, log_density_at, opacity_of, place_at, sum_of_terms
 from .launch import BORROWS, kernel, launch, num_threads
 from .rows import trailing_zeros
+from .tasks import next_task, none_taken
 
 SAMPLES_AT_ONCE = 8  # of a ray: while one is waiting for memory, the others are
 
@@ -64,6 +65,7 @@ def trace(
         vertices.numpy(),
         wanted.numpy(),
         (*_scratch(num_threads(), max(SAMPLES_AT_ONCE, splits), bricks.shape[2]), cells_of_workers(num_threads())),
+        none_taken(),
         (0,) * bricks.shape[2],
     )  # fmt: skip
     return states, numbers, vertices.view(-1), wanted
@@ -98,6 +100,7 @@ def _trace(
     vertices: Any,
     wanted: Any,
     scratch: Any,
+    taken: Any,
     lanes: Any,
 ) -> None:
     num_workers = len(scratch[0])
@@ -109,7 +112,8 @@ def _trace(
         intervals = scratch[0][worker], scratch[1][worker, 0]
         found, parts = (scratch[1][worker, 1], scratch[2][worker, 0]), (scratch[1][worker, 2], scratch[2][worker, 1])
         values, moved, cells = scratch[3][worker], scratch[4][worker], scratch[5][worker]
-        for group in range(worker, num_groups, num_workers):
+        group = next_task(taken)
+        while group < num_groups:
             for r in range(group * RAYS_AT_ONCE, min((group + 1) * RAYS_AT_ONCE, len(near))):
                 if numbers[r] < 0:
                     continue
@@ -133,6 +137,7 @@ def _trace(
                     first, last = ends_of(j, course)
                     _mark_brick(first, last, splits, course, lattice, contents, moved, wanted)
                 numbers[r] = j if end > GOES_ON else end
+            group = next_task(taken)
 
 
 @njit(forceinline=True, **BORROWS)
