@@ -20,7 +20,7 @@ from dnerf.deformations import Deformation
 from dnerf.deformations.fixed_point import jacobians
 from dnerf.evaluation import spread_indices
 from dnerf.files import write_json
-from dnerf.motion import motion_model
+from dnerf.motion import Trajectories, motion_model
 from dnerf.renderer import Renderer
 from dnerf.tracks import render_tracks, seen_points
 from dnerf.video import FORMATS, write_frames, write_png
@@ -63,13 +63,26 @@ def main(config: DictConfig) -> None:
     print(f"residual: median {tracks.residuals.median():.2e}, largest {tracks.residuals.max():.2e} world units")
     model = motion_model(renderer)
     if isinstance(model, Deformation):
-        smallest = min(
-            float(torch.linalg.det(jacobians(model, places, torch.full_like(places[:, 0], time))).min())
-            for places, time in zip(tracks.positions, times)
-        )
-        print(f"smallest Jacobian determinant along the tracks: {smallest:.3f} (negative where space folds)")
+        _print_folding(model, tracks)
     if isinstance(data, SyntheticData):
         _measure(renderer, data, Path(config.run) / "motion.json", device)
+
+
+def _print_folding(deformation: Deformation, tracks: Trajectories) -> None:
+    """How the map into canonical space stretches and folds along tracks."""
+    found = torch.cat(
+        [
+            jacobians(deformation, places, time.expand(len(places)))
+            for places, time in zip(tracks.positions, tracks.times, strict=True)
+        ]
+    )
+    determinants, smallest = torch.linalg.det(found), torch.linalg.svdvals(found)[:, -1].sort().values
+    low, high = (smallest[round(share * (len(smallest) - 1))] for share in (0.05, 0.95))
+    print(
+        f"smallest Jacobian determinant along the tracks: {determinants.min():.3f} (negative where space folds: "
+        f"{(determinants < 0).float().mean():.2%}); smallest singular value {low:.2f} to {high:.2f} (middle 90 %; 1 is "
+        "rigid)"
+    )
 
 
 def _camera(config: DictConfig, data: object, device: torch.device) -> Camera:
