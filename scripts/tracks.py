@@ -17,7 +17,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.data import SyntheticData
 from dnerf.deformations import Deformation
-from dnerf.deformations.fixed_point import jacobians
+from dnerf.deformations.folding import folding
 from dnerf.evaluation import spread_indices
 from dnerf.files import write_json
 from dnerf.motion import Trajectories, motion_model
@@ -69,19 +69,11 @@ def main(config: DictConfig) -> None:
 
 
 def _print_folding(deformation: Deformation, tracks: Trajectories) -> None:
-    """How the map into canonical space stretches and folds along tracks."""
-    found = torch.cat(
-        [
-            jacobians(deformation, places, time.expand(len(places)))
-            for places, time in zip(tracks.positions, tracks.times, strict=True)
-        ]
-    )
-    determinants, smallest = torch.linalg.det(found), torch.linalg.svdvals(found)[:, -1].sort().values
-    low, high = (smallest[round(share * (len(smallest) - 1))] for share in (0.05, 0.95))
+    found = folding(deformation, tracks.positions, tracks.times[:, None].expand(tracks.positions.shape[:-1]))
+    low, high = found.stretch
     print(
-        f"smallest Jacobian determinant along the tracks: {determinants.min():.3f} (negative where space folds: "
-        f"{(determinants < 0).float().mean():.2%}); smallest singular value {low:.2f} to {high:.2f} (middle 90 %; 1 is "
-        "rigid)"
+        f"smallest Jacobian determinant along the tracks: {found.least_determinant:.3f} (negative where space folds: "
+        f"{found.share_folded:.2%}); smallest singular value {low:.2f} to {high:.2f} (middle 90 %; 1 is rigid)"
     )
 
 
