@@ -186,6 +186,7 @@ def test_table_gradient_does_not_depend_on_threads():
 
 def test_table_gradient_split_into_row_blocks_is_the_same():
     from dnerf.kernels.cpu import grid_encode as cpu
+    from dnerf.kernels.cpu.tasks import none_taken
 
     positions, table = (x.numpy() for x in example(500))
     grad = torch.randn(500, 9, dtype=torch.float64).numpy()
@@ -194,8 +195,8 @@ def test_table_gradient_split_into_row_blocks_is_the_same():
         torch.zeros(table.shape, dtype=torch.float64),
         torch.zeros(table.shape, dtype=torch.float64),
     )
-    cpu._grad_table(grad, positions, levels, 0, 2, whole.numpy(), (0,) * 3)
-    cpu._grad_table(grad, positions, levels, 2, 5, parts.numpy(), (0,) * 3)
+    cpu._grad_table(grad, positions, levels, 0, whole.numpy(), 2, none_taken(), (0,) * 3)
+    cpu._grad_table(grad, positions, levels, 2, parts.numpy(), 5, none_taken(), (0,) * 3)
     assert torch.equal(whole, parts)
 
 
