@@ -16,7 +16,6 @@ from dnerf.kernels.brick_lookup import BRICK, VERTICES
 
 logger = logging.getLogger(__name__)
 
-MOST = torch.finfo(torch.float16).max
 CHUNK = 32  # bricks asked at a time, always as many: matrix libraries compile code for every new number of rows
 
 
@@ -161,10 +160,11 @@ class BakedField(RadianceField):
         end = self.num_bricks + len(missing)
         self._make_room(end)
         numbers = torch.arange(self.num_bricks, end, device=missing.device)
+        most = torch.finfo(self.bricks.dtype).max
         for part, number in zip((missing * BRICK).split(CHUNK), numbers.split(CHUNK), strict=True):
             asked = torch.cat([part, part[-1:].expand(CHUNK - len(part), 3)])
             points = self.low + (asked[:, None] + vertices).reshape(-1, 3) / self.cells_per_unit
-            values = self.field.contents(points).clamp(-MOST, MOST).reshape(CHUNK, VERTICES, -1)
+            values = self.field.contents(points).clamp(-most, most).reshape(CHUNK, VERTICES, -1)
             self.bricks[number] = values[: len(part)].to(self.bricks.dtype)
         self.slots[missing.unbind(-1)] = numbers
         self.num_bricks = end

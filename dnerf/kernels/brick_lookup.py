@@ -22,10 +22,10 @@ def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tens
     Args:
         positions: (N, 3) in cells, from the lattice's low corner; on the face between two bricks the upper one counts.
         slots: (Bx, By, Bz) int64, number of the brick that is there, or -1.
-        bricks: (M, 729, F) values, in single, double or half precision.
+        bricks: (M, 729, F) values, float16, float32 or float64.
 
     Returns:
-        values (N, F) in the dtype of `bricks`, or single precision for half, 0 where nothing is known, and whether
+        values (N, F) in the dtype of `bricks`, or float32 for float16, 0 where nothing is known, and whether
         they are known (N,) bool: the position is inside the lattice and its brick exists.
 
     Raises:
@@ -37,6 +37,8 @@ def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tens
         raise ValueError(f"slots must be int64 of shape (Bx, By, Bz), got {slots.dtype} {tuple(slots.shape)}")
     if bricks.ndim != 3 or bricks.shape[1] != VERTICES:
         raise ValueError(f"bricks must have shape (M, {VERTICES}, F), got {tuple(bricks.shape)}")
+    if bricks.dtype not in (torch.float16, torch.float32, torch.float64):
+        raise ValueError(f"bricks must be float16, float32 or float64, got {bricks.dtype}")
     positions = positions.to(torch.promote_types(bricks.dtype, torch.float32))
     if choose(positions) == "reference":
         return brick_lookup_reference(positions, slots, bricks)

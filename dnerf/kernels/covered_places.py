@@ -5,7 +5,6 @@ from itertools import product
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from .backend import choose, run_compiled
 
@@ -56,9 +55,3 @@ def covered_places_reference(lows: Tensor, ends: Tensor, shape: Sequence[int]) -
     for axis, size in enumerate(shape):
         changes = changes.cumsum(axis).narrow(axis, 0, size)
     return (changes > 0).reshape(-1).nonzero()[:, 0]
-
-
-def with_three_axes(lows: Tensor, ends: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor, tuple[int, ...]]:
-    """The same boxes and raster with axes of one place in front."""
-    lacking = MOST_AXES - len(shape)
-    return pad(lows, (0, 0, lacking, 0)), pad(ends, (0, 0, lacking, 0), value=1), (1,) * lacking + shape

@@ -116,6 +116,7 @@ def test_op_is_registered_properly():
         ({"positions": torch.zeros(4)}, r"positions must have shape \(N, 3\)"),
         ({"slots": torch.zeros(1, 1, 1)}, "slots must be int64"),
         ({"bricks": torch.zeros(1, 512, 1)}, "bricks must have shape"),
+        ({"bricks": torch.zeros(1, VERTICES, 1).bfloat16()}, "bricks must be float16, float32 or float64"),
     ],
 )
 def test_wrong_shapes_are_refused(wrong, message):

@@ -223,6 +223,7 @@ def test_op_is_registered_properly():
         ({"is_known": torch.zeros(1, 4, 4, dtype=torch.bool)}, "is_known must be bool of three axes of at least 2"),
         ({"slots": torch.zeros(0, 2, 2, dtype=torch.int64)}, "slots must be int64"),
         ({"waves": torch.zeros(2, dtype=torch.float64)}, "waves must be float32"),
+        ({"bricks": torch.zeros(1, VERTICES, 8).bfloat16()}, "bricks must be float32 or float16"),
     ],
 )
 def test_wrong_tables_are_refused(wrong, message):

@@ -6,13 +6,16 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from ..covered_places import with_three_axes
+from ..covered_places import MOST_AXES
 from .launch import BORROWS, kernel
 
 
 def covered_places(lows: Tensor, ends: Tensor, shape: tuple[int, ...]) -> Tensor:
-    lows, ends, sides = with_three_axes(lows, ends, shape)
+    lacking = MOST_AXES - len(shape)  # axes of one place, in front
+    sides = (1,) * lacking + shape
+    lows, ends = pad(lows, (0, 0, lacking, 0)), pad(ends, (0, 0, lacking, 0), value=1)
     out = torch.empty(math.prod(sides), dtype=torch.int64)
     changes, is_touched = np.empty((*sides[:2], sides[2] + 1), np.int32), np.zeros(sides[:2], np.bool_)
     count = _covered(lows.contiguous().numpy(), ends.contiguous().numpy(), changes, is_touched, out.numpy())
