@@ -12,6 +12,7 @@ from dnerf.fields import DeformedField
 from dnerf.renderer import Renderer
 
 SHARE_THAT_IS_SEEN = 1e-3
+PLASTIC = 1.1347241384015194
 
 
 class Loss(nn.Module, ABC):
@@ -130,12 +131,16 @@ class HiddenMatterLoss(Loss):
         self.register_buffer("box", as_box(box), persistent=False)
         self.register_buffer("num_calls", torch.zeros((), dtype=torch.int64))
         self.register_buffer("last_seen", torch.full((resolution,) * 3, -memory - 1, dtype=torch.int64))
+        # Kronecker's sequence in five dimensions: powers of the root of x^6 = x + 1 (Roberts 2018).
+        powers = torch.arange(1, 6, dtype=torch.float64)
+        self.register_buffer("generators", PLASTIC**-powers, persistent=False)
         self.box: Tensor
+        self.generators: Tensor
         self.num_calls: Tensor
         self.last_seen: Tensor
 
     def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
-        """Weighted mean opacity; other places at every call, the same again after a run is continued."""
+        """Weighted mean opacity; other places at every call, evenly spread over many of them."""
         field = renderer.field
         if not isinstance(field, DeformedField):
             raise ValueError(f"HiddenMatterLoss needs a deformed field, got {type(field).__name__}")
@@ -143,16 +148,19 @@ class HiddenMatterLoss(Loss):
         assert rendering.weights is not None
         self.to(rendering.rgb.device)
         self.num_calls += 1
-        seen = rendering.output.extras["canonical_positions"].detach()[rendering.weights > SHARE_THAT_IS_SEEN]
-        self.last_seen.view(-1)[self._cells(seen)] = self.num_calls
-        generator = torch.Generator(seen.device).manual_seed(int(self.num_calls))
-        places = renderer.sampler.places(self.num_points, generator)
+        # Nothing here waits for a device: which samples are seen, and how many, is known there only.
+        calls = torch.where(rendering.weights > SHARE_THAT_IS_SEEN, self.num_calls, torch.iinfo(torch.int64).min)
+        cells = self._cells(rendering.output.extras["canonical_positions"].detach())
+        self.last_seen.view(-1).scatter_reduce_(0, cells.reshape(-1), calls.reshape(-1), "amax")
+        number = self.num_calls * self.num_points + torch.arange(self.num_points, device=calls.device)
+        unit = (number[:, None] * self.generators % 1).to(rendering.rgb.dtype)
+        places = renderer.sampler.places(unit.clamp(max=1 - torch.finfo(unit.dtype).eps))
         if places is None:
             return rendering.rgb.new_zeros(())
-        with torch.no_grad(), renderer.autocast(seen.device):
+        with torch.no_grad(), renderer.autocast(calls.device):
             canonical = field.deformation(*places)
         is_hidden = self.num_calls - self.last_seen.view(-1)[self._cells(canonical)] > self.memory
-        with renderer.autocast(seen.device):
+        with renderer.autocast(calls.device):
             density = field.canonical.density(canonical, places[1])
         return self.weight * (is_hidden * -torch.expm1(-self.length * density)).mean()
 

@@ -128,19 +128,40 @@ class AdamMuon(torch.optim.Adam):
             parameter.grad = gradient
         return loss
 
-    def _orthogonal_step(self, members: list[tuple[nn.Parameter, Tensor]], rate: float, momentum: float) -> None:
+    def make_capturable(self) -> None:
+        """Keep learning rates and counts on the parameters' device, so that steps can be part of a CUDA graph.
+
+        A rate then is a scalar tensor, which `set_rates` fills.
+        """
+        for group in self.param_groups:
+            group["capturable"] = True
+            if not isinstance(group["lr"], Tensor):
+                group["lr"] = torch.tensor(float(group["lr"]), device=group["params"][0].device)
+
+    def set_rates(self, factor: float) -> None:
+        """Set every group's learning rate to its initial one times a factor."""
+        for group in self.param_groups:
+            rate = group["initial_lr"] * factor
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+
+    def _orthogonal_step(
+        self, members: list[tuple[nn.Parameter, Tensor]], rate: float | Tensor, momentum: float
+    ) -> None:
         by_shape: dict[torch.Size, list[tuple[nn.Parameter, Tensor]]] = defaultdict(list)
         for parameter, gradient in members:
             state = self.state[parameter]
             if not state:
-                state["step"], state["exp_avg"] = torch.zeros(()), torch.zeros_like(parameter)
+                state["step"], state["exp_avg"] = torch.zeros((), device=parameter.device), torch.zeros_like(parameter)
             state["step"] += 1
             average = state["exp_avg"].lerp_(gradient, 1 - momentum)
             by_shape[parameter.shape].append((parameter, torch.lerp(gradient, average, momentum)))
         for shape, alike in by_shape.items():
             steps = orthogonalized(torch.stack([direction for _, direction in alike]))
-            for (parameter, _), step in zip(alike, steps, strict=True):
-                parameter.sub_(step, alpha=rate * RMS_OF_ADAM * max(shape) ** 0.5)
+            steps = steps * (rate * (RMS_OF_ADAM * max(shape) ** 0.5))
+            torch._foreach_sub_([parameter for parameter, _ in alike], list(steps.unbind()))
 
 
 def moments_of(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> frozenset[str]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dnerf.checks import check_shape
+from dnerf.fixed_size import fit
 
 if TYPE_CHECKING:
     from dnerf.compositing import FieldOutput
@@ -213,6 +214,37 @@ class Samples:
             ray_indices=self.ray_indices[whole],
             ray_offsets=before[self.offsets],
         )
+
+    def fitted(self, counts: Tensor, size: int) -> "tuple[Samples, Tensor]":
+        """Packed samples, each interval cut into so many equal ones or (0) left out, in a fixed number of places.
+
+        What `kept` and `split` do, without waiting for a device. Rays that do not fit get none; places that are left
+        are intervals of length zero at distance 0, at the ends of all rays.
+
+        Args:
+            counts: (N,) int64 parts of every interval, >= 0.
+            size: number of samples of the result.
+
+        Returns:
+            The samples, and how many there would have been, () int64.
+
+        Raises:
+            ValueError: for dense samples, samples with points of their own, or none.
+        """
+        if self.ray_indices is None or self.points is not None or not len(self.starts):
+            raise ValueError("samples must be packed, some, with their points in the middle, to be fitted")
+        check_shape("counts", counts, self.starts.shape)
+        chosen = fit(self.offsets, counts, size)
+        starts, ends, parts = (x[chosen.source] for x in (self.starts, self.ends, counts.to(self.starts.dtype)))
+        length = parts.clamp(min=1)
+        samples = Samples(
+            torch.where(chosen.is_filled, torch.lerp(starts, ends, chosen.part / length), 0),
+            torch.where(chosen.is_filled, torch.lerp(starts, ends, (chosen.part + 1) / length), 0),
+            self.num_rays,
+            ray_indices=chosen.rays,
+            ray_offsets=chosen.offsets,
+        )
+        return samples, chosen.wanted
 
     def packed(self, mask: Tensor | None = None) -> "Samples":
         """Return dense samples as packed ones, only those where `mask` (R, S) holds (all if None)."""

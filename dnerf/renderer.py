@@ -13,6 +13,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.compositing import FieldOutput, Rendering, composite, safe_divide
 from dnerf.fields.base import RadianceField
+from dnerf.frame_graphs import FrameGraphs
 from dnerf.kernels import few_nonzero
 from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
@@ -37,6 +38,8 @@ class Renderer(nn.Module):
         sampler: where along rays it is evaluated.
         background: what lies behind; white if None.
         quadrature: how density between samples is read, "constant", "linear" or "parabolic": see `dnerf.quadrature`.
+        graphs: on a GPU, replay whole images as CUDA graphs, for samplers that can place samples in a fixed number of
+            places. All of a picture's intervals are asked for densities then, at no lattice and in no bricks.
         precision: "float32", or "bfloat16" to run networks under autocast; positions, encodings and compositing stay
             float32 either way.
         stop_transmittance: whole images end a ray of packed samples once so little light is left, which changes
@@ -57,6 +60,7 @@ class Renderer(nn.Module):
         precision: str = "float32",
         stop_transmittance: float = 0.0,
         quadrature: str = "constant",
+        graphs: bool = False,
     ) -> None:
         super().__init__()
         if not 0 <= stop_transmittance < 1:
@@ -69,6 +73,8 @@ class Renderer(nn.Module):
         self.precision = precision
         self.stop_transmittance = stop_transmittance
         self.quadrature = quadrature
+        self.graphs = graphs
+        self._frames: FrameGraphs | None = None
 
     @property
     def device(self) -> torch.device:
@@ -178,6 +184,11 @@ class Renderer(nn.Module):
         with self.autocast(self.device):
             self.sampler.update(self.field, step)
 
+    def learn(self, probes: Tensor) -> None:
+        """Let the sampler learn from the field at random places, see `Sampler.learn`."""
+        with self.autocast(self.device):
+            self.sampler.learn(self.field, probes)
+
     def autocast(self, device: torch.device) -> torch.autocast:
         """A context in which networks run in the renderer's precision on a device."""
         dtype = PRECISIONS[self.precision]
@@ -197,7 +208,7 @@ class Renderer(nn.Module):
         kept (`RadianceField.finished`), so it knows nothing of later changes of the field. Sampler and background are
         this renderer's own.
         """
-        pays = num_frames >= FRAMES_THAT_SHARE and self.sampler.share <= MOST_TO_SHARE
+        pays = num_frames >= FRAMES_THAT_SHARE and self.sampler.share <= MOST_TO_SHARE and not self._replays
         field = self.field.finished() if pays else self.field
         if field is self.field:
             return self
@@ -208,6 +219,7 @@ class Renderer(nn.Module):
             precision=self.precision,
             stop_transmittance=self.stop_transmittance,
             quadrature=self.quadrature,
+            graphs=self.graphs,
         )
         model.training = self.training
         return model
@@ -234,21 +246,49 @@ class Renderer(nn.Module):
         modes = [(module, module.training) for module in self.modules()]
         self.eval()
         try:
-            seen = self.sampler.seen_pixels(camera, time)
-            field = self.field.at_time(time)
-            parts = list(self._in_chunks(camera.rays(time, seen), field, chunk, self._tracer(field, camera, time)))
-            columns = [torch.cat([p.rgb, p.opacity[:, None], p.depth[:, None]], dim=-1) for p in parts]
-            if seen is None:
-                picture = torch.cat(columns)
-            else:
-                picture = self._empty(camera, time)
-                for pixels, column in zip(seen.split([len(c) for c in columns]), columns, strict=True):
-                    picture[pixels] = column
+            picture = self._replayed(camera, time, chunk) if self._replays else None
+            if picture is None:
+                picture = self._walked(camera, time, chunk)
         finally:
             for module, mode in modes:
                 module.training = mode
         picture = picture.reshape(camera.intrinsics.height, camera.intrinsics.width, 5)
         return Rendering(rgb=picture[..., :3], opacity=picture[..., 3], depth=picture[..., 4])
+
+    def _walked(self, camera: Camera, time: float, chunk: int) -> Tensor:
+        """A picture (P, 5) whose rays end where they are opaque."""
+        seen = self.sampler.seen_pixels(camera, time)
+        field = self.field.at_time(time)
+        parts = list(self._in_chunks(camera.rays(time, seen), field, chunk, self._tracer(field, camera, time)))
+        columns = [_columns(part) for part in parts]
+        if seen is None:
+            return torch.cat(columns)
+        picture = self._empty(camera, time)
+        for pixels, column in zip(seen.split([len(c) for c in columns]), columns, strict=True):
+            picture[pixels] = column
+        return picture
+
+    @property
+    def _replays(self) -> bool:
+        return self.graphs and self.device.type == "cuda"
+
+    def _replayed(self, camera: Camera, time: float, chunk: int) -> Tensor | None:
+        """A picture (P, 5) as one graph, which holds while tensors stay where they are; None for lack of memory."""
+        if self._frames is None or self._frames.device != self.device:
+            self._frames = FrameGraphs(self.device)
+        places = tuple(tensor.data_ptr() for tensor in chain(self.parameters(), self.buffers()))
+        state = (places, self.sampler.settings, self.precision, self.stop_transmittance, self.quadrature)
+        try:
+            return self._frames.picture(camera, time, chunk=chunk, state=state, show=self._fixed)
+        except torch.OutOfMemoryError:
+            self._frames = None
+            logger.warning("the GPU's memory does not suffice for a graph of %d rays: going on without", chunk)
+            return None
+
+    def _fixed(self, rays: Rays, marched: int, kept: int) -> tuple[Tensor, Tensor]:
+        with self.autocast(rays.origins.device):
+            samples, wanted = self.sampler.to_size(rays, self.field, marched, kept, min_weight=self.stop_transmittance)
+        return _columns(self._render(rays, samples, self.field)), wanted
 
     def _empty(self, camera: Camera, time: float) -> Tensor:
         """A picture (P, 5) of nothing: the background, no opacity, no depth."""
@@ -275,6 +315,11 @@ class Renderer(nn.Module):
                 continue
             start += chunk
             yield part
+
+
+def _columns(shown: Rendering) -> Tensor:
+    """Colour, opacity and depth (R, 5)."""
+    return torch.cat([shown.rgb, shown.opacity[:, None], shown.depth[:, None]], dim=-1)
 
 
 def _in_parts(field: RadianceField, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from dnerf.checkpoints import MAX_HEADER, check_fit, decode, encode, num_bytes, read_limited
 from dnerf.data.frames import Frames
 from dnerf.files import write_bytes
-from dnerf.optimizers import moments_of
+from dnerf.optimizers import AdamMuon, moments_of
 from dnerf.records import TrainingRecord, not_finite
 
 logger = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ class RunState:
     """
 
     modules: Mapping[str, nn.Module]
-    optimizer: torch.optim.Optimizer
+    optimizer: AdamMuon
     generator: torch.Generator
     num_rays: int
     step: int = 0

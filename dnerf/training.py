@@ -7,20 +7,21 @@ from contextlib import nullcontext
 from signal import Signals
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
 from dnerf.checks import check_choice, check_positive
-from dnerf.compositing import Rendering
-from dnerf.data.frames import Frames, composite_on
+from dnerf.data.frames import Frames
 from dnerf.distributed import Processes
+from dnerf.graphs import GraphCache
 from dnerf.losses import Loss, PhotometricLoss
 from dnerf.optimizers import SCHEDULES, AdamMuon, rate_factor
 from dnerf.records import Callback, Outcome, TrainingRecord, check_finite, psnr_of, report, show
-from dnerf.recovery import SHOWN, Recovery, what_is_shown
+from dnerf.recovery import SHOWN, Recovery
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder, RunState, advice_on_memory, fingerprint, max_bytes
+from dnerf.steps import LOOK_EVERY, Steps, rays_that_fit
 from dnerf.stopping import StopRequest, TrainingStopped, stop_requests
 from dnerf.time_window import TimeWindow
 
@@ -51,6 +52,9 @@ class Trainer:
         epsilon: Adam's epsilon.
         orthogonal: parameter-name prefixes of the renderer below which the weight matrices of networks (those of 16
             rows and columns or more) take orthogonalised steps, see `AdamMuon`.
+        graphs: samples in fixed numbers of places, whatever rays meet, so that on a GPU the steps of one process are
+            replayed as CUDA graphs, without Python between their kernels. For samplers that can, with `target_samples`.
+        marched_per_sample: then, intervals in occupied cells for which there are places, per sample.
         losses: terms by name; the photometric loss if None.
         loss_every: by name of a term, n: it is asked on every n-th step and counts n times there, which costs less and
             means the same on average; names that are none are ignored, others take part in every step.
@@ -79,6 +83,8 @@ class Trainer:
         betas: Sequence[float] = (0.9, 0.999),
         epsilon: float = 1e-8,
         orthogonal: Sequence[str] = (),
+        graphs: bool = False,
+        marched_per_sample: float = 3.0,
         losses: Mapping[str, Loss] | None = None,
         loss_every: Mapping[str, int] | None = None,
         time_window: TimeWindow | None = None,
@@ -93,6 +99,7 @@ class Trainer:
             ("max_rays", max_rays),
             ("final_learning_rate", final_learning_rate),
             ("log_every", log_every),
+            ("marched_per_sample", marched_per_sample),
             ("checkpoint_every", 1 if checkpoint_every is None else checkpoint_every),
             ("max_seconds", 1 if max_seconds is None else max_seconds),
             ("target_samples", 1 if target_samples is None else target_samples),
@@ -103,6 +110,8 @@ class Trainer:
         for name, every in (loss_every or {}).items():
             if int(every) != every:
                 raise ValueError(f"loss_every.{name} must be a whole number of steps, got {every}")
+        if graphs and target_samples is None:
+            raise ValueError("target_samples must be given with graphs, got null")
         self.num_steps = num_steps
         self.max_seconds = max_seconds
         self.num_rays = num_rays
@@ -117,6 +126,8 @@ class Trainer:
         self.betas = (betas[0], betas[1])
         self.epsilon = epsilon
         self.orthogonal = tuple(orthogonal)
+        self.graphs = graphs
+        self.marched_per_sample = marched_per_sample
         self.losses = nn.ModuleDict({"rgb": PhotometricLoss()} if losses is None else dict(losses))
         self.loss_every = dict(loss_every or {})
         self.time_window = time_window
@@ -169,6 +180,9 @@ class Trainer:
         if checkpoints is not None:
             run.data = fingerprint(frames)
         renderer.train()
+        places = self._places(processes)
+        if places is not None:
+            renderer.sampler.fix_sizes(int(self.marched_per_sample * places), places)
         self._warm_up(renderer, frames)
         if resume and checkpoints is not None:
             self._restore(run, checkpoints, processes)
@@ -179,6 +193,8 @@ class Trainer:
         bar = tqdm(total=100, disable=not is_shown, dynamic_ncols=True, bar_format=BAR)
         with bar, catching as request, processes.watched(), advice_on_memory(run):
             self._loop(run, renderer, frames, processes, callbacks, checkpoints, request, bar)
+        if places is not None:
+            renderer.sampler.fix_sizes(None)
         renderer.set_progress(1.0)
         renderer.eval()
         assert run.record is not None
@@ -202,20 +218,26 @@ class Trainer:
         bar: tqdm,
     ) -> None:
         """Steps, records and checkpoints until the end or a signal; every process takes the same turns."""
-        model = processes.wrap(renderer)
+        steps = self._steps(run, renderer, processes.wrap(renderer), frames, processes)
         while not self._is_finished(run):
             begin = time.perf_counter()
-            outcome = self._step(run, model, frames, processes)
+            outcome = self._step(run, renderer, steps, processes)
             seconds = run.seconds + time.perf_counter() - begin
             run.seconds, num_samples, signal = processes.agree(seconds, outcome.num_samples, request.number)
             run.step += 1
             used_rays, wanted_rays = run.num_rays, self._next_num_rays(run.num_rays, num_samples)
+            if self.graphs and self.target_samples is not None:
+                is_known = run.step % LOOK_EVERY == 0
+                fullness = num_samples / self.target_samples
+                wanted_rays = rays_that_fit(used_rays, fullness, self.max_rays) if is_known else used_rays
             run.rays_done, run.num_rays = run.rays_done + used_rays, max(wanted_rays, processes.size)
             ends = self._is_finished(run)
             saves = checkpoints is not None and bool(ends or signal or self._is_due(run.step))
             # What is saved has been looked at.
             if saves or run.step == 1 or ends or run.step % self.log_every == 0:
                 record = self._examined(run, outcome, processes, used_rays, num_samples)
+                if record is None:
+                    steps.forget()
                 if record is not None and processes.is_first:
                     report(record, renderer, callbacks)
                     show(bar, record, self._progress(run), run.rays_done)
@@ -256,50 +278,46 @@ class Trainer:
             loss.backward()
         renderer.zero_grad(set_to_none=True)
 
-    def _step(self, run: RunState, model: nn.Module, frames: Frames, processes: Processes) -> Outcome:
+    def _places(self, processes: Processes) -> int | None:
+        """Places that each process has for samples, if their number is fixed."""
+        return -(-self.target_samples // processes.size) if self.graphs and self.target_samples is not None else None
+
+    def _steps(
+        self, run: RunState, renderer: Renderer, model: nn.Module, frames: Frames, processes: Processes
+    ) -> Steps:
+        """What takes steps; it replays them where sizes are fixed, unless processes train together."""
+        graphs = None
+        if self.graphs and processes.size == 1:
+            if renderer.device.type == "cuda":
+                run.optimizer.make_capturable()
+            graphs = GraphCache(renderer.device, [run.generator], list(renderer.parameters()))
+        return Steps(
+            model, renderer, frames, run.optimizer, run.generator,
+            losses={name: loss for name, loss in self.losses.items() if isinstance(loss, Loss)},
+            loss_every=self.loss_every, shows=self.recovery is not None,
+            fixed=self._places(processes), graphs=graphs,
+        )  # fmt: skip
+
+    def _step(self, run: RunState, renderer: Renderer, steps: Steps, processes: Processes) -> Outcome:
         """One optimiser step on this process's share of a random batch."""
-        renderer, progress = run.modules["renderer"], self._progress(run)
-        assert isinstance(renderer, Renderer)
+        progress, frames = self._progress(run), steps.frames
         renderer.set_progress(progress)
         factor = rate_factor(self.schedule, self.final_learning_rate, self.warmup_steps, progress, run.step)
-        for group in run.optimizer.param_groups:
-            group["lr"] = group["initial_lr"] * factor * (1.0 if self.recovery is None else self.recovery.factor)
+        run.optimizer.set_rates(factor * (1.0 if self.recovery is None else self.recovery.factor))
         processes.merge_observations(renderer, run.step)
-        renderer.update(run.step)
-        generator, num_rays, share = run.generator, run.num_rays, processes.share(run.num_rays)
+        steps.update(run.step)
+        generator, num_rays = run.generator, run.num_rays
         if self.time_window is None:
             indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)
         else:
             indices = self.time_window.draw(frames.times, frames.num_pixels, num_rays, progress, generator=generator)
-        rays, rgba = frames.pixels(indices[share])
-        with processes.same_randomness(generator, num_rays):
-            rendering = model(rays, generator=generator)
-        assert rendering.background is not None
-        assert rendering.samples is not None
-        target = composite_on(rgba, rendering.background)
-        terms, total = self._terms(run.step + 1, rendering, target, renderer)
-        run.optimizer.zero_grad(set_to_none=True)
+        indices = indices[processes.share(num_rays)]
         # Shares may differ by a ray: weighted so, their mean is that over all rays.
-        weight = len(rays) * processes.size / num_rays
-        if total.requires_grad:
-            (total * weight if weight != 1 else total).backward()
-            run.optimizer.step()
-        mse = (rendering.rgb.detach() - target).square().mean()
-        shown = {} if self.recovery is None else what_is_shown(rendering, target)
-        detached = {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse, **shown}.items()}
-        return Outcome(detached, weight, rendering.samples.starts.numel(), factor)
-
-    def _terms(
-        self, number: int, rendering: Rendering, target: Tensor, renderer: Renderer
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """The terms whose turn a step is, by name, and what it minimises; steps are counted from 1."""
-        terms, total = {}, rendering.rgb.new_zeros(())
-        for name, loss in self.losses.items():
-            every = self.loss_every.get(name, 1)
-            if number % every == 0:
-                terms[name] = loss(rendering, target, renderer)
-                total = total + every * terms[name]
-        return terms, total
+        weight = len(indices) * processes.size / num_rays
+        scalars, num_samples = steps(
+            indices, run.step + 1, weight, lambda: processes.same_randomness(generator, num_rays)
+        )
+        return Outcome(scalars, weight, num_samples, factor)
 
     def _next_num_rays(self, num_rays: int, num_samples: int) -> int:
         if self.target_samples is None:

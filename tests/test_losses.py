@@ -191,8 +191,6 @@ def test_hidden_matter_is_looked_for_in_occupied_cells_and_elsewhere_each_time()
 def test_hidden_matter_costs_nothing_where_nobody_knows_of_any() -> None:
     renderer = guided()
     assert HiddenMatterLoss(BOX)(NOTHING, TARGET, Renderer(renderer.field, StratifiedSampler(4))) == 0
-    renderer.sampler.occupy(torch.zeros_like(renderer.sampler.occupied))
-    assert HiddenMatterLoss(BOX)(NOTHING, TARGET, renderer) == 0
 
 
 @pytest.mark.parametrize(

@@ -110,3 +110,24 @@ def test_bad_arguments_are_named() -> None:
         AdamMuon([{"params": parameters((3, 3))}], momentum=1.0)
     with pytest.raises(ValueError, match="one of the optimiser's"):
         moments_of(AdamMuon([{"params": parameters((3, 3))}]), torch.nn.Parameter(torch.zeros(2)))
+
+
+@pytest.mark.gpu
+def test_rates_on_the_device_take_the_same_steps() -> None:
+    """As CUDA graphs want them; the factor changes from step to step."""
+    runs = []
+    for is_capturable in (False, True):
+        shared = [torch.nn.Parameter(p.detach().cuda()) for p in parameters((5, 3), (16, 16))]
+        groups = [{"params": shared[:1]}, {"params": shared[1:], "orthogonal": True}]
+        optimizer = AdamMuon([{**group, "initial_lr": 0.1} for group in groups], lr=0.1)
+        if is_capturable:
+            optimizer.make_capturable()
+        for step in range(4):
+            optimizer.set_rates(1 / (step + 1))
+            for p in shared:
+                p.grad = torch.sin(p.detach() + step)
+            optimizer.step()
+        assert {isinstance(group["lr"], torch.Tensor) for group in optimizer.param_groups} == {is_capturable}
+        runs.append(shared)
+    for a, b in zip(*runs, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)

@@ -1,6 +1,7 @@
 """What a frame of a finished model takes, alone and in a sequence, and how near it comes to the truth."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from torch import Tensor
 from dnerf.benchmarks.scenes import train_model
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import time_in_turn
+from dnerf.cameras import Intrinsics
 from dnerf.data.frames import Frames
 from dnerf.evaluation import spread_indices
 from dnerf.metrics import psnr
@@ -22,15 +24,20 @@ ALONE, SHARED = "one frame", "in a sequence"
 
 def run(settings: Settings) -> SuiteResult:
     """Render the same frames of every model in all ways, in turn."""
-    rows = [row for name, parts in _models(settings) for row in _measure(name, parts, settings)]
+    scales = [1] if settings.quick else settings.options["scales"]
+    rows = [
+        row for name, parts in _models(settings) for scale in scales for row in _measure(name, parts, settings, scale)
+    ]
     return SuiteResult(
         title="Milliseconds of a frame",
         summary=(
             "Frames of a split, spread evenly, rendered in evaluation mode, one after the other, and compared with the "
             f"true pictures. `{ALONE}`: nothing is kept from frame to frame. `{SHARED}`: what frames share (canonical "
             "space in bricks) is kept, as `render.py` does for long films, and was computed before the clock starts; "
-            "left out where haze forbids it. `splits`: parts of a step in which something is seen "
-            "(`sampler.render_splits`; the run's own comes first). All ways of a model are timed in turn."
+            "left out where haze forbids it, or where a GPU replays frames as graphs. "
+            "`splits`: parts of a step in which something is seen "
+            "(`sampler.render_splits`; the run's own comes first). Larger pictures "
+            "than the data's are shown, not compared. All ways of a model are timed in turn."
         ),
         tables=[Table("Frames", rows, "PSNR in dB, mean over the frames; medians and quartiles of their mean time.")],
         plots=[_plot(rows)],
@@ -47,39 +54,45 @@ def _models(settings: Settings) -> Iterator[tuple[str, Mapping[str, Any]]]:
         yield options["scene"], train_model(settings)
 
 
-def _measure(name: str, parts: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]]:
+def _measure(name: str, parts: Mapping[str, Any], settings: Settings, scale: float) -> list[dict[str, Any]]:
     options = settings.options
     renderer: Renderer = parts["renderer"].to(settings.device).eval()
     frames: Frames = parts["data"].frames(options["split"]).to(settings.device)
     chosen = spread_indices(len(frames), 1 if settings.quick else options["num_frames"])
-    count = len(chosen)
+    count, camera = len(chosen), frames.intrinsics
+    shown = camera.resized(round(camera.width * scale), round(camera.height * scale))
     background = renderer.background(torch.zeros(1, 3, device=settings.device))[0]
     truths = [frames.image(i, background) for i in chosen]
     calls = {
-        way: partial(_pictures, model, way[1], frames, chosen, parts["chunk"])
+        way: partial(_pictures, model, way[1], frames, chosen, shown, parts["chunk"])
         for way, model in _ways(renderer, [] if settings.quick else options["splits"])
     }
-    scores = {
-        way: sum(psnr(picture.clamp(0, 1), truth) for picture, truth in zip(call(), truths, strict=True)) / count
-        for way, call in calls.items()
-    }
+    scores = {way: _score(call(), truths) for way, call in calls.items()}
     timings = time_in_turn(
         {str(way): call for way, call in calls.items()},
         seconds=0.1, min_repeats=1 if settings.quick else options["repeats"], device=settings.device,
     )  # fmt: skip
-    size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
+    size = f"{shown.width} x {shown.height}"
     return [
         {
             "run": name,
             "size": size,
             "shown": way[0],
             "splits": way[1],
-            "psnr": float(scores[way]),
+            "psnr": scores[way],
             **{column: value / count for column, value in timings[str(way)].milliseconds.items()},
             "frames_per_second": count / timings[str(way)].median,
         }
         for way in calls
     ]
+
+
+def _score(pictures: list[Tensor], truths: list[Tensor]) -> float | None:
+    """Mean PSNR in dB; None for pictures of another size."""
+    if pictures[0].shape != truths[0].shape:
+        return None
+    scores = [float(psnr(picture.clamp(0, 1), truth)) for picture, truth in zip(pictures, truths, strict=True)]
+    return sum(scores) / len(scores)
 
 
 def _ways(renderer: Renderer, splits: list[int]) -> Iterator[tuple[tuple[str, int | None], Renderer]]:
@@ -92,14 +105,19 @@ def _ways(renderer: Renderer, splits: list[int]) -> Iterator[tuple[tuple[str, in
             yield (shown, value), model
 
 
-def _pictures(renderer: Renderer, splits: int | None, frames: Frames, chosen: list[int], chunk: int) -> list[Tensor]:
+def _pictures(
+    renderer: Renderer, splits: int | None, frames: Frames, chosen: list[int], shown: Intrinsics, chunk: int
+) -> list[Tensor]:
     if isinstance(renderer.sampler, OccupancySampler) and splits is not None:
         renderer.sampler.render_splits = splits  # of all ways: they share a sampler
-    return [renderer.render_image(frames.camera(i), float(frames.times[i]), chunk=chunk).rgb for i in chosen]
+    cameras = [replace(frames.camera(i), intrinsics=shown) for i in chosen]
+    times = [float(frames.times[i]) for i in chosen]
+    return [renderer.render_image(camera, time, chunk=chunk).rgb for camera, time in zip(cameras, times, strict=True)]
 
 
 def _plot(rows: list[dict[str, Any]]) -> Plot:
     series = []
+    rows = [row for row in rows if row["psnr"] is not None]
     for name, shown in dict.fromkeys((row["run"], row["shown"]) for row in rows):
         part = [row for row in rows if (row["run"], row["shown"]) == (name, shown)]
         part.sort(key=lambda row: row["splits"] or 0)
@@ -120,11 +138,11 @@ def _plot(rows: list[dict[str, Any]]) -> Plot:
 
 def _findings(rows: list[dict[str, Any]]) -> list[str]:
     """What every run's own settings take: the first row of each way to show it."""
-    own: dict[tuple[str, str], dict[str, Any]] = {}
+    own: dict[tuple[str, str, str], dict[str, Any]] = {}
     for row in rows:
-        own.setdefault((row["run"], row["shown"]), row)
+        own.setdefault((row["run"], row["shown"], row["size"]), row)
     return [
-        f"{name}, {row['size']}, {shown}: {row['median_ms']:.0f} ms [{row['low_ms']:.0f}, {row['high_ms']:.0f}], "
-        f"{row['psnr']:.2f} dB."
-        for (name, shown), row in own.items()
+        f"{name}, {size}, {shown}: {row['median_ms']:.3g} ms [{row['low_ms']:.3g}, {row['high_ms']:.3g}]"
+        + ("." if row["psnr"] is None else f", {row['psnr']:.2f} dB.")
+        for (name, shown, size), row in own.items()
     ]

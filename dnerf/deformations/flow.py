@@ -152,7 +152,8 @@ class FlowDeformation(InvertibleDeformation):
                 result = self.solver.solve_adjoint(_AdjointEquation(self, watch), (positions, start, spans))[0]
             else:
                 result = self.solver.solve(watched, positions)
-            if bool(torch.isfinite(result).all()):
+            # A graph that is recorded asks nothing; what is not finite then shows in the loss.
+            if _is_recorded(result) or bool(torch.isfinite(result).all()):
                 return result
         except AssertionError as error:
             problem = f"the solver stopped ({error})"
@@ -173,6 +174,10 @@ class FlowDeformation(InvertibleDeformation):
             field = self.velocity.at(start)
             return lambda s, positions: column * field(positions)
         return lambda s, positions: column * self.velocity(positions, start + s * spans)
+
+
+def _is_recorded(values: Tensor) -> bool:
+    return values.is_cuda and torch.cuda.is_current_stream_capturing()
 
 
 class _AdjointEquation(nn.Module):

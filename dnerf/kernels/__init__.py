@@ -6,6 +6,7 @@ from .covered_places import covered_places
 from .few_nonzero import few_nonzero
 from .grid_encode import GridLevels, grid_encode
 from .march import MarchedSamples, MarchGrid, march
+from .march_to_size import march_to_size
 from .packed_sum import packed_sum
 from .packed_weights import packed_weights
 from .relu_layers import relu_layers
@@ -25,6 +26,7 @@ __all__ = [
     "get_backend",
     "grid_encode",
     "march",
+    "march_to_size",
     "packed_sum",
     "packed_weights",
     "relu_layers",

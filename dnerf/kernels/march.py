@@ -84,6 +84,32 @@ def march(
     Raises:
         ValueError: a shape or dtype that does not fit, or a step that is not positive.
     """
+    check_march(origins, directions, near, far, times, jitter, occupancy, aabb)
+    if not step > 0:
+        raise ValueError(f"step must be positive, got {step}")
+    if max_samples_per_ray is not None and max_samples_per_ray < 1:
+        raise ValueError(f"max_samples_per_ray must be at least 1, got {max_samples_per_ray}")
+    if skips is not None and skips.shape != blocks_shape(occupancy):
+        raise ValueError(f"skips must have shape {blocks_shape(occupancy)}, got {tuple(skips.shape)}")
+    dtype = torch.promote_types(origins.dtype, torch.float32)
+    rays = [x.to(dtype) for x in (origins, directions, near, far, times, jitter)]
+    arguments: tuple[Any, ...] = (*rays, occupancy, aabb.to(dtype), float(step), max_samples_per_ray)
+    if choose(rays[0]) == "reference":
+        return march_reference(*arguments)
+    return MarchedSamples(*torch.ops.dnerf.march(*arguments, skips))
+
+
+def check_march(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    occupancy: Tensor,
+    aabb: Tensor,
+) -> None:
+    """Raise ValueError unless shapes and dtypes are those that `march` asks for."""
     num_rays = origins.shape[0]
     for name, value in (("origins", origins), ("directions", directions)):
         if value.shape != (num_rays, 3):
@@ -97,18 +123,6 @@ def march(
         )
     if aabb.shape != (2, 3):
         raise ValueError(f"aabb must have shape (2, 3), got {tuple(aabb.shape)}")
-    if not step > 0:
-        raise ValueError(f"step must be positive, got {step}")
-    if max_samples_per_ray is not None and max_samples_per_ray < 1:
-        raise ValueError(f"max_samples_per_ray must be at least 1, got {max_samples_per_ray}")
-    if skips is not None and skips.shape != blocks_shape(occupancy):
-        raise ValueError(f"skips must have shape {blocks_shape(occupancy)}, got {tuple(skips.shape)}")
-    dtype = torch.promote_types(origins.dtype, torch.float32)
-    rays = [x.to(dtype) for x in (origins, directions, near, far, times, jitter)]
-    arguments: tuple[Any, ...] = (*rays, occupancy, aabb.to(dtype), float(step), max_samples_per_ray)
-    if choose(rays[0]) == "reference":
-        return march_reference(*arguments)
-    return MarchedSamples(*torch.ops.dnerf.march(*arguments, skips))
 
 
 def march_reference(
@@ -163,7 +177,7 @@ def kept_intervals(
 
 
 def interval_ranges(
-    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, jitter: Tensor, aabb: Tensor, step: float
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, jitter: Tensor, aabb: Tensor, step: float | Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The part of [near, far] inside the closed box, and the intervals that may overlap with it.
 

@@ -78,29 +78,91 @@ class Sampler(nn.Module, ABC):
         """
         return None
 
+    def to_size(
+        self,
+        rays: Rays,
+        field: RadianceField,
+        marched: int,
+        kept: int,
+        *,
+        min_weight: float,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Samples, Tensor]:
+        """Samples in a fixed number of places, found without waiting for a device. Not every sampler can.
+
+        Rays that do not fit get none: they show the background, and train nothing.
+
+        Args:
+            rays: R rays.
+            field: which is asked for densities.
+            marched: places for intervals that may hold something.
+            kept: places for samples.
+            min_weight: in the picture, up to which intervals are left out; 0 for none.
+            generator: source of randomness in training mode.
+
+        Returns:
+            Packed samples, `kept` of them, some of length zero; and how many places of either kind were wanted, (2,).
+
+        Raises:
+            ValueError: if this sampler cannot (unless overridden).
+        """
+        raise ValueError(f"{type(self).__name__} cannot place samples in a fixed number of places")
+
+    def fix_sizes(self, marched: int | None, kept: int | None = None) -> None:
+        """In training, place samples by `to_size` from now on, in so many places; None for no more.
+
+        Raises:
+            ValueError: if this sampler cannot (unless overridden).
+        """
+        if marched is not None:
+            raise ValueError(f"{type(self).__name__} cannot place samples in a fixed number of places")
+
+    def fullness(self) -> float:
+        """The larger share of its fixed places that the last training batch wanted; above 1, some rays went without."""
+        raise ValueError(f"{type(self).__name__} has no fixed number of places")
+
+    @property
+    def settings(self) -> tuple[object, ...]:
+        """What decides, beside tensors, how samples are placed now: when it changes, CUDA graphs are recorded anew."""
+        return ()
+
     @property
     def share(self) -> float:
         """Share of space, averaged over time, in which pictures have samples; 1 unless known to be less."""
         return 1.0
 
-    def places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
-        """Random places where matter may be, evenly spread over all of them; None if this sampler does not know.
+    def places(self, unit: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Places where matter may be, evenly spread over all of them; None if this sampler does not know.
 
         Args:
-            count: of places.
-            generator: of the randomness, on the sampler's device.
+            unit: (N, 5) numbers in [0, 1), evenly spread: which region, and the time and the position within it.
 
         Returns:
-            positions (count, 3) in world units and times (count,) in [0, 1].
+            positions (N, 3) in world units and times (N,) in [0, 1].
         """
         return None
 
     def update(self, field: RadianceField, step: int) -> None:
-        """Learn from the field between training steps; does nothing unless overridden.
+        """Learn from the field between training steps, if this sampler does and it is time.
 
         Args:
             field: the field in training.
             step: number of training steps done so far.
+        """
+        probes = self.probes(step)
+        if probes is not None:
+            self.learn(field, probes)
+
+    def probes(self, step: int) -> Tensor | None:
+        """Random numbers (N, K) for `learn`, or None if nothing is to be learnt after so many steps."""
+        return None
+
+    def learn(self, field: RadianceField, probes: Tensor) -> None:
+        """Learn from the field at random places; does nothing, and waits for no device, unless overridden.
+
+        Args:
+            field: the field in training.
+            probes: from `probes`.
         """
 
     def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:

@@ -10,7 +10,7 @@ from dnerf.checks import check_positive
 from dnerf.compositing import render_weights
 from dnerf.fields.base import RadianceField
 from dnerf.geometry import cube_corners
-from dnerf.kernels import MarchGrid, covered_places, few_nonzero, march
+from dnerf.kernels import MarchGrid, covered_places, few_nonzero, march, march_to_size
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.samplers.visibility import joined, visible_weights
@@ -125,13 +125,19 @@ class OccupancySampler(OccupancyGrid):
         self.min_weight = min_weight
         self.filter_joins = filter_joins
         self.pad_to = pad_to
+        self.sizes: tuple[int, int] | None = None
+        self.register_buffer("length", torch.tensor(float(step_size)), persistent=False)
+        self.register_buffer("wanted", torch.zeros(2, dtype=torch.int64), persistent=False)
+        self.length: Tensor
+        self.wanted: Tensor
 
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Packed samples; intervals begin at random offsets in training, at multiples of the step in evaluation."""
-        jitter = torch.zeros_like(rays.near)
-        if self.training:
-            jitter.uniform_(generator=generator)
-        samples = self._march(rays, jitter)
+        if self.training and self.sizes is not None:
+            samples, wanted = self.to_size(rays, field, *self.sizes, min_weight=self.min_weight, generator=generator)
+            self.wanted.copy_(wanted)
+            return samples
+        samples = self._march(rays, self._jitter(rays, generator))
         if not self.training:
             return samples.split(self.render_splits)
         if self.min_weight > 0:
@@ -139,6 +145,10 @@ class OccupancySampler(OccupancyGrid):
         else:
             samples = samples.split(self.training_splits)
         return samples.padded(self.pad_to)
+
+    def _jitter(self, rays: Rays, generator: torch.Generator | None) -> Tensor:
+        jitter = torch.zeros_like(rays.near)
+        return jitter.uniform_(generator=generator) if self.training else jitter
 
     def first(self, rays: Rays, most: int) -> Samples | None:
         """In evaluation mode, the first samples of each ray; what lies behind is not marched through."""
@@ -156,6 +166,60 @@ class OccupancySampler(OccupancyGrid):
         weights = render_weights(optical_depth, samples) * samples.per_sample(transmittance)
         is_seen = ~(weights <= min_weight)  # NaN is
         return self._split(samples.kept(is_seen), weights[is_seen], self.render_splits).padded(self.pad_to)
+
+    def fix_sizes(self, marched: int | None, kept: int | None = None) -> None:
+        """In training, place samples by `to_size` from now on, in so many places; None for no more."""
+        self.sizes = None if marched is None or kept is None else (marched, kept)
+
+    def fullness(self) -> float:
+        """The larger share of its fixed places that the last batch wanted; above 1, some rays went without."""
+        if self.sizes is None:
+            return super().fullness()
+        return max(wanted / size for wanted, size in zip(self.wanted.tolist(), self.sizes, strict=True))
+
+    @property
+    def settings(self) -> tuple[object, ...]:
+        """See `Sampler.settings`."""
+        return self.sizes, self.training, self.training_splits, self.render_splits, self.is_narrow
+
+    @torch.no_grad()
+    def to_size(
+        self,
+        rays: Rays,
+        field: RadianceField,
+        marched: int,
+        kept: int,
+        *,
+        min_weight: float,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Samples, Tensor]:
+        """Samples in a fixed number of places, see `Sampler.to_size`; all intervals are asked for densities at once."""
+        intervals, num_marched = march_to_size(
+            rays.origins,
+            rays.directions,
+            rays.near,
+            rays.far,
+            times=rays.times,
+            jitter=self._jitter(rays, generator),
+            occupancy=self.looked_into(self.is_narrow or not self.training)[0],
+            aabb=self.box,
+            step=self.length if self.training else self.length.new_full((), self.step_size),
+            size=marched,
+        )
+        samples = Samples(
+            intervals.starts, intervals.ends, len(rays), ray_indices=intervals.ray_indices,
+            ray_offsets=intervals.offsets,
+        )  # fmt: skip
+        positions, _, times = samples.locate(rays)
+        density = field.density(positions, times)
+        if self.training:
+            self.observe(positions, times, torch.where(samples.lengths > 0, density, 0))
+        weights = render_weights(density * samples.lengths, samples)
+        splits = self.training_splits if self.training else self.render_splits
+        is_seen = ~(weights <= min_weight) if min_weight else torch.ones_like(weights, dtype=torch.bool)
+        counts = torch.where(weights <= self.split_weight, 1, splits) * (is_seen & (samples.lengths > 0))  # NaN is
+        samples, num_wanted = samples.fitted(counts, kept)
+        return samples, torch.stack([num_marched, num_wanted])
 
     def _split(self, samples: Samples, weights: Tensor, count: int) -> Samples:
         """Samples of which those whose weight exceeds `split_weight` are cut into so many parts."""
@@ -185,6 +249,7 @@ class OccupancySampler(OccupancyGrid):
         part = min(progress / self.coarse_until, 1.0)
         self.training_splits = self.splits if part == 1 else 1
         self.training_step = self.coarse_step * (self.step_size / self.coarse_step) ** part
+        self.length.fill_(self.training_step)
         self.is_narrow = progress >= self.narrow_from
 
     def grid_at(self, time: float, dtype: torch.dtype) -> MarchGrid:

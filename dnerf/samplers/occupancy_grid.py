@@ -9,7 +9,7 @@ from dnerf.checks import as_box, check_positive
 from dnerf.fields.base import RadianceField
 from dnerf.kernels import skip_distances
 from dnerf.samplers.base import Sampler
-from dnerf.samplers.masks import slab_halves, widened
+from dnerf.samplers.masks import slab_halves, spread_over, widened
 
 SPACE = (1, 2, 3)  # axes
 NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no picture shows
@@ -95,15 +95,14 @@ class OccupancyGrid(Sampler):
         return self.occupied, self.skips
 
     @torch.no_grad()
-    def places(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
-        """Random positions and times in occupied cells, or None if no cell is occupied."""
-        if self._cells is None or self._cells.device != self.occupied.device:
-            self._cells = self.occupied.view(-1).nonzero()[:, 0]
-        if not len(self._cells):
-            return None
-        device = self._cells.device
-        chosen = torch.randint(len(self._cells), (count,), generator=generator, device=device)
-        return self._within(self._cells[chosen], torch.rand(count, 4, generator=generator, device=device))
+    def places(self, unit: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions and times in occupied cells (in any, if none is), see `Sampler.places`."""
+        if unit.is_cuda:
+            return self._within(spread_over(self.occupied, unit[:, 0]), unit[:, 1:])
+        if self._cells is None:
+            cells = self.occupied.view(-1).nonzero()[:, 0]
+            self._cells = cells if len(cells) else torch.arange(self.occupied.numel())
+        return self._within(self._cells[(unit[:, 0] * len(self._cells)).long()], unit[:, 1:])
 
     @torch.no_grad()
     def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:
@@ -114,17 +113,20 @@ class OccupancyGrid(Sampler):
         flat = (cells * self.strides).sum(-1)
         self.maxima.view(-1).scatter_reduce_(0, flat, density.to(self.maxima.dtype), "amax")
 
-    @torch.no_grad()
-    def update(self, field: RadianceField, step: int) -> None:
-        """Probe random cells every `update_every` steps and decide anew which are occupied."""
+    def probes(self, step: int) -> Tensor | None:
+        """Every `update_every` steps, numbers (num_probes, 5) in [0, 1): which cell, and where in it."""
         if step == 0 or step % self.update_every:
-            return
+            return None
         device = self.maxima.device
         generator = torch.Generator(device).manual_seed(step)
-        cells = torch.randint(self.maxima.numel(), (self.num_probes,), generator=generator, device=device)
-        within = torch.rand(self.num_probes, 4, generator=generator, device=device)
+        return torch.rand(self.num_probes, 5, generator=generator, device=device)
+
+    @torch.no_grad()
+    def learn(self, field: RadianceField, probes: Tensor) -> None:
+        """Probe cells of the field, and decide anew which are occupied."""
+        cells = (probes[:, 0] * self.maxima.numel()).long()
         self.maxima.mul_(self.decay).clamp_(min=NEGLIGIBLE * 1e-3)
-        self._probe(field, cells, within)
+        self._probe(field, cells, probes[:, 1:])
         self.decide()
 
     @torch.no_grad()
@@ -167,7 +169,7 @@ class OccupancyGrid(Sampler):
 
     def _within(self, cells: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
         """Positions (N, 3) and times (N,) at places (N, 4) in [0, 1] within cells (N,)."""
-        unit = (torch.stack(torch.unravel_index(cells, self.maxima.shape), dim=-1) + within) / self.shape
+        unit = (cells[:, None] // self.strides % self.shape + within) / self.shape
         return torch.lerp(self.box[0], self.box[1], unit[:, 1:]), unit[:, 0]
 
     @torch.no_grad()

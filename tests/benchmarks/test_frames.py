@@ -14,13 +14,13 @@ from dnerf.samplers import OccupancySampler, StratifiedSampler
 from dnerf.scenes import SCENES
 
 BOX = [[-1.5] * 3, [1.5] * 3]
-OPTIONS = {"runs": ["runs/one"], "split": "test", "num_frames": 2, "splits": [3, 1], "repeats": 1}
+OPTIONS = {"runs": ["runs/one"], "split": "test", "num_frames": 2, "scales": [1], "splits": [3, 1], "repeats": 1}
 
 
-def rows(renderer: Renderer) -> list[dict]:
+def rows(renderer: Renderer, **options: object) -> list[dict]:
     data = SyntheticData(SCENES["static"](), resolution=16, num_train=1, num_val=1, num_test=3)
     parts = {"renderer": renderer, "data": data, "chunk": 4096}
-    result = run_suite("frames", Settings(load=lambda run: parts, options=OPTIONS))
+    result = run_suite("frames", Settings(load=lambda run: parts, options={**OPTIONS, **options}))
     assert all(row["median_ms"] > 0 for row in result.tables[0].rows)
     assert {row["run"] for row in result.tables[0].rows} == {"one"}
     return list(result.tables[0].rows)
@@ -63,3 +63,8 @@ def test_other_samplers_have_one_way_and_settings_must_read_runs() -> None:
     assert [(row["shown"], row["splits"]) for row in found] == [("one frame", None)]
     with pytest.raises(ValueError, match="load must be given"):
         run_suite("frames", Settings(options=OPTIONS))
+
+
+def test_pictures_of_another_size_are_timed_and_not_compared() -> None:
+    found = rows(Renderer(SCENES["static"](), StratifiedSampler(16)), scales=[1, 1.5])
+    assert [(row["size"], row["psnr"] is None) for row in found] == [("16 x 16", False), ("24 x 24", True)]

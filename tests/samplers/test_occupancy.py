@@ -15,6 +15,7 @@ from dnerf.kernels import skip_distances
 from dnerf.rays import Rays
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, Sampler
+from dnerf.samplers.masks import spread_over
 
 BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 
@@ -405,3 +406,39 @@ def test_first_samples_and_what_follows_are_all_samples(most: int) -> None:
 
 def test_training_does_not_march_in_pieces() -> None:
     assert OccupancySampler(BOX, 0.05).train().first(rays_towards_origin(4), 2) is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 1.0])
+def test_places_are_found_without_a_list_of_them(share: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    mask, unit = torch.rand(3, 4, 5, generator=generator) < share, torch.rand(200, generator=generator)
+    listed = mask.view(-1).nonzero()[:, 0] if mask.any() else torch.arange(60)
+    assert torch.equal(spread_over(mask, unit), listed[(unit * len(listed)).long()])
+
+
+def test_places_lie_in_occupied_cells() -> None:
+    sampler = small(margin=0)
+    sampler.fill(MovingBall())
+    unit = torch.rand(500, 5, generator=torch.Generator().manual_seed(0))
+    positions, times = sampler.places(unit)
+    cells = ((positions - sampler.box[0]) / (sampler.box[1] - sampler.box[0]) * sampler.shape[1:]).long()
+    slabs = (times * sampler.shape[0]).long()
+    assert sampler.occupied[(slabs, *cells.unbind(-1))].all()
+    assert len(slabs.unique()) > 5
+
+
+def test_rays_that_do_not_fit_have_no_samples() -> None:
+    sampler = small().eval()
+    sampler.fill(MovingBall())
+    rays = rays_towards_origin(200)
+    samples, wanted = sampler.to_size(rays, MovingBall(), 1 << 14, 50, min_weight=1e-3)
+    assert samples.starts.shape == (50,)
+    assert wanted[0] < 1 << 14
+    assert wanted[1] > 50
+    assert int((samples.lengths > 0).sum()) <= 50
+    everything, _ = sampler.to_size(rays, MovingBall(), 1 << 14, 1 << 14, min_weight=1e-3)
+    assert everything.ray_indices is not None
+    assert samples.ray_indices is not None
+    last = samples.ray_indices[samples.lengths > 0].max()
+    is_same = (everything.ray_indices <= last) & (everything.lengths > 0)
+    assert torch.equal(samples.starts[samples.lengths > 0], everything.starts[is_same])

@@ -1,14 +1,21 @@
 # mypy: disallow_untyped_defs=False, disallow_incomplete_defs=False
 """Triton version of `march`: one program per ray, a lane per interval."""
 
+from functools import lru_cache
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from dnerf.fixed_size import spread
+
 from ..march import interval_ranges
 
 BLOCK = 64
+RANGES = 5  # place of the rays' ranges among the kernel's arguments
+# Fused multiply-adds would round differently from the definition.
+OPTIONS = {"num_warps": 1, "enable_fp_fusion": False}
 
 
 def march(
@@ -24,9 +31,61 @@ def march(
     max_samples_per_ray: int | None,
     skips: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    num_rays = len(near)
-    shape = torch.tensor(occupancy.shape[1:], device=aabb.device, dtype=aabb.dtype)
-    arguments = (
+    arguments = _arguments(origins, directions, near, far, times, jitter, occupancy, aabb, near.new_full((1,), step))
+    limit = torch.iinfo(torch.int64).max if max_samples_per_ray is None else max_samples_per_ray
+    num_rays, offsets = len(near), torch.zeros(len(near) + 1, dtype=torch.int64, device=near.device)
+    if num_rays:
+        _march[(num_rays,)](*arguments, limit, offsets, near, near, offsets, *occupancy.shape, False, BLOCK, **OPTIONS)
+        torch.cumsum(offsets, 0, out=offsets)
+    # The number of samples decides the outputs' size: the one point where the host waits for the device.
+    num_samples = int(offsets[-1])
+    starts, ends = near.new_empty(num_samples), near.new_empty(num_samples)
+    ray_indices = offsets.new_empty(num_samples)
+    if num_samples:
+        outputs = (offsets, starts, ends, ray_indices)
+        _march[(num_rays,)](*arguments, limit, *outputs, *occupancy.shape, True, BLOCK, **OPTIONS)
+    return starts, ends, ray_indices, offsets
+
+
+def march_to_size(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    occupancy: Tensor,
+    aabb: Tensor,
+    step: Tensor,
+    size: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    arguments = _arguments(origins, directions, near, far, times, jitter, occupancy, aabb, step.reshape(1))
+    ranges, limit = arguments[RANGES], torch.iinfo(torch.int64).max
+    num_rays, counts = len(near), torch.zeros(len(near) + 1, dtype=torch.int64, device=near.device)
+    _march[(num_rays,)](*arguments, limit, counts, near, near, counts, *occupancy.shape, False, BLOCK, **OPTIONS)
+    wanted = counts[1:]
+    filled, offsets = spread(wanted, size)
+    ranges[:, 3] = torch.where(filled == wanted, ranges[:, 3], 0)  # Rays that do not fit look at no interval.
+    starts, ends = near.new_zeros(size), near.new_zeros(size)
+    indices = torch.repeat_interleave(offsets.diff(), output_size=size)
+    outputs = (offsets, starts, ends, torch.empty_like(indices))
+    _march[(num_rays,)](*arguments, limit, *outputs, *occupancy.shape, True, BLOCK, **OPTIONS)
+    return starts, ends, indices, offsets, wanted.sum()
+
+
+def _arguments(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    times: Tensor,
+    jitter: Tensor,
+    occupancy: Tensor,
+    aabb: Tensor,
+    step: Tensor,
+) -> tuple[Tensor, ...]:
+    """What the kernel reads; `step` is (1,)."""
+    return (
         origins.contiguous(),
         directions.contiguous(),
         near.contiguous(),
@@ -35,23 +94,15 @@ def march(
         torch.stack((*interval_ranges(origins, directions, near, far, jitter, aabb, step),), -1),
         occupancy.contiguous().view(torch.uint8),
         aabb.contiguous(),
-        shape / (aabb[1] - aabb[0]),
-        origins.new_full((1,), step),
-        torch.iinfo(torch.int64).max if max_samples_per_ray is None else max_samples_per_ray,
+        _shape(tuple(occupancy.shape[1:]), aabb.device, aabb.dtype) / (aabb[1] - aabb[0]),
+        step,
     )
-    offsets = torch.zeros(num_rays + 1, dtype=torch.int64, device=near.device)
-    # Fused multiply-adds would round differently from the definition.
-    options = {"num_warps": 1, "enable_fp_fusion": False}
-    if num_rays:
-        _march[(num_rays,)](*arguments, offsets, near, near, offsets, *occupancy.shape, False, BLOCK, **options)
-        torch.cumsum(offsets, 0, out=offsets)
-    # The number of samples decides the outputs' size: the one point where the host waits for the device.
-    num_samples = int(offsets[-1])
-    starts, ends = near.new_empty(num_samples), near.new_empty(num_samples)
-    ray_indices = offsets.new_empty(num_samples)
-    if num_samples:
-        _march[(num_rays,)](*arguments, offsets, starts, ends, ray_indices, *occupancy.shape, True, BLOCK, **options)
-    return starts, ends, ray_indices, offsets
+
+
+@lru_cache(maxsize=16)
+def _shape(shape: tuple[int, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Kept, since a copy from the host would have to be waited for."""
+    return torch.tensor(shape, device=device, dtype=dtype)
 
 
 @triton.jit

@@ -1,0 +1,140 @@
+"""One optimiser step: pixels are rendered, compared and learnt from; op by op, or replayed as a CUDA graph."""
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.data.frames import Frames, composite_on
+from dnerf.graphs import GraphCache
+from dnerf.losses import Loss
+from dnerf.optimizers import AdamMuon
+from dnerf.recovery import what_is_shown
+from dnerf.renderer import Renderer
+
+LOOK_EVERY = 16  # steps between looks at how full fixed places are: each waits for the device
+FULL = (0.8, 0.97)  # shares of fixed places that are left alone: another number of rays is another graph
+AIM = 0.9
+UPDATE = "update"
+ROUND_TO = 256  # rays, where places are fixed
+
+
+class Steps:
+    """Optimiser steps of one run.
+
+    Args:
+        model: what is called with rays: the renderer, or what wraps it.
+        renderer: whose parameters are optimised.
+        frames: with the pixels to learn from, on the renderer's device.
+        optimizer: of the parameters.
+        generator: of all randomness.
+        losses: terms by name.
+        loss_every: by name, steps between a term's turns, in which it counts as many times.
+        shows: whether it is asked how much batches show, see `what_is_shown`.
+        fixed: samples for which the sampler has places, if their number is fixed.
+        graphs: replays steps, for a fixed number of samples; None for steps op by op.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        renderer: Renderer,
+        frames: Frames,
+        optimizer: AdamMuon,
+        generator: torch.Generator,
+        *,
+        losses: Mapping[str, Loss],
+        loss_every: Mapping[str, int],
+        shows: bool,
+        fixed: int | None = None,
+        graphs: GraphCache | None = None,
+    ) -> None:
+        self.model = model
+        self.renderer = renderer
+        self.frames = frames
+        self.optimizer = optimizer
+        self.generator = generator
+        self.losses = losses
+        self.loss_every = loss_every
+        self.shows = shows
+        self.fixed = fixed
+        self.graphs = graphs
+        self._num_samples = 0
+
+    def __call__(
+        self, indices: Tensor, number: int, weight: float, randomness: Callable[[], AbstractContextManager[None]]
+    ) -> tuple[Mapping[str, Tensor], int]:
+        """Learn from some pixels.
+
+        Args:
+            indices: (R,) of the pixels.
+            number: of the step, counted from 1: some losses take turns.
+            weight: of the batch's loss.
+            randomness: what random draws are made in.
+
+        Returns:
+            Scalars on the device: the terms whose turn it is, "loss", "mse" and what recovery looks at; they hold until
+            the next step. And the number of samples; of a fixed number of places, how many were wanted when that was
+            last looked at.
+        """
+        turns = [name for name in self.losses if number % self.loss_every.get(name, 1) == 0]
+
+        def work(indices: Tensor) -> dict[str, Tensor]:
+            with randomness():
+                return self._optimize(indices, turns, weight)
+
+        if self.graphs is None:
+            scalars: Mapping[str, Tensor] = work(indices)
+        else:
+            state = (len(indices), weight, self.renderer.sampler.settings)
+            scalars = self.graphs.run(tuple(turns), state, work, indices)
+        if self.fixed is not None and number % LOOK_EVERY == 0:
+            self._num_samples = int(self.renderer.sampler.fullness() * self.fixed)
+        return scalars, self._num_samples
+
+    def update(self, step: int) -> None:
+        """Let the sampler learn from the field, between steps; `step` counts those done."""
+        if self.graphs is None:
+            self.renderer.update(step)
+            return
+        probes = self.renderer.sampler.probes(step)
+        if probes is not None:
+            self.graphs.run(UPDATE, len(probes), self._learn, probes)
+
+    def _learn(self, probes: Tensor) -> dict[str, Tensor]:
+        self.renderer.learn(probes)
+        return {}
+
+    def forget(self) -> None:
+        """Record graphs anew: the optimiser's tensors have been replaced."""
+        if self.graphs is not None:
+            self.graphs.forget()
+
+    def _optimize(self, indices: Tensor, turns: list[str], weight: float) -> dict[str, Tensor]:
+        rays, rgba = self.frames.pixels(indices)
+        rendering = self.model(rays, generator=self.generator)
+        assert rendering.background is not None
+        assert rendering.samples is not None
+        if self.fixed is None:
+            self._num_samples = rendering.samples.starts.numel()
+        target = composite_on(rgba, rendering.background)
+        terms = {name: self.losses[name](rendering, target, self.renderer) for name in turns}
+        total = rendering.rgb.new_zeros(())
+        for name, term in terms.items():
+            total = total + self.loss_every.get(name, 1) * term
+        self.optimizer.zero_grad(set_to_none=True)
+        if total.requires_grad:
+            (total * weight if weight != 1 else total).backward()
+            self.optimizer.step()
+        mse = (rendering.rgb.detach() - target).square().mean()
+        shown = what_is_shown(rendering, target) if self.shows else {}
+        return {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse, **shown}.items()}
+
+
+def rays_that_fit(num_rays: int, fullness: float, most: int) -> int:
+    """How many rays to take next, of which so many filled that share of their fixed places."""
+    if FULL[0] <= fullness <= FULL[1]:
+        return num_rays
+    wanted = num_rays * min(max(AIM / max(fullness, 1e-3), 0.25), 4)
+    return max(min(int(wanted), most) // ROUND_TO * ROUND_TO, ROUND_TO)

@@ -1,0 +1,129 @@
+"""Pictures in a fixed number of places: the same as others, in any chunks, for any view and time."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from device_waits import DeviceWaits
+from fixed_models import small_renderer
+from torch import Tensor
+
+from dnerf.cameras import Camera, Intrinsics, look_at
+from dnerf.frame_graphs import MOST_VIEWS, FrameGraphs
+from dnerf.rays import Rays
+from dnerf.renderer import Renderer
+
+SIZE = Intrinsics(24, 20, 30.0, 30.0)
+
+
+def camera(device: torch.device, angle: float = 0.0) -> Camera:
+    return Camera(SIZE, look_at((4.0, angle, 1.0)).to(device))
+
+
+def trained(device: str = "cpu", *, graphs: bool = False) -> Renderer:
+    """A model with a ball of matter in it, in the cells around it."""
+    renderer = small_renderer(device=device, graphs=graphs, render_margin=0)
+    field = renderer.field
+
+    def density(positions: Tensor, times: Tensor) -> Tensor:
+        return 20 * torch.sigmoid(20 * (0.7 - (positions - 0.2 * times[..., None]).norm(dim=-1)))
+
+    kept = field.canonical.density  # type: ignore[union-attr,operator]
+    field.canonical.density = density  # type: ignore[union-attr,method-assign,assignment]
+    renderer.sampler.fill(field)  # type: ignore[operator]
+    field.canonical.density = kept  # type: ignore[union-attr,method-assign]
+    return renderer.eval()
+
+
+def pictured(graphs: FrameGraphs, renderer: Renderer, view: Camera, time: float, chunk: int = 10000) -> Tensor:
+    return graphs.picture(view, time, chunk=chunk, state=0, show=renderer._fixed)
+
+
+@pytest.mark.parametrize("chunk", [480, 100, 7])
+def test_pictures_are_those_of_walked_rays(chunk: int) -> None:
+    renderer = trained()
+    graphs = FrameGraphs(renderer.device)
+    for time, angle in ((0.0, 0.0), (0.9, 2.0)):
+        view = camera(renderer.device, angle)
+        picture = renderer.render_image(view, time)
+        found = pictured(graphs, renderer, view, time, chunk).reshape(20, 24, 5)
+        assert float(picture.opacity.max()) > 0.2
+        # Either leaves out intervals seen as little as 1e-3, which not all are the same.
+        torch.testing.assert_close(found[..., :3], picture.rgb, rtol=0, atol=0.01)
+        torch.testing.assert_close(found[..., 3], picture.opacity, rtol=0, atol=0.01)
+
+
+def test_sizes_grow_until_all_fits() -> None:
+    asked: list[tuple[int, int]] = []
+
+    def show(rays: Rays, marched: int, kept: int) -> tuple[Tensor, Tensor]:
+        asked.append((marched, kept))
+        wanted = 50000 if float(rays.times[0]) > 0.5 else 10
+        return rays.times[:, None].clone(), torch.tensor([wanted, 5])
+
+    graphs = FrameGraphs(torch.device("cpu"))
+    for time in (0.0, 0.1, 0.9, 0.2):
+        picture = graphs.picture(camera(torch.device("cpu")), time, chunk=1000, state=0, show=show)
+        assert picture.shape == (480, 1)
+        torch.testing.assert_close(picture, torch.full_like(picture, time))
+    assert asked[0] == (1920, 1920)  # a guess
+    assert asked[1] == (2048, 2048)
+    assert asked[2] == (2048, 2048)  # not enough: shown again
+    assert asked[3][0] > 50000
+    assert asked[4] == asked[3]
+
+
+def test_few_views_are_kept() -> None:
+    renderer = trained()
+    graphs = FrameGraphs(renderer.device)
+    for focal in range(30, 40):
+        view = replace(camera(renderer.device), intrinsics=Intrinsics(8, 6, float(focal), float(focal)))
+        assert pictured(graphs, renderer, view, 0.5).shape == (48, 5)
+        assert len(graphs._sizes) <= MOST_VIEWS
+
+
+def test_a_picture_waits_once() -> None:
+    renderer = trained()
+    graphs = FrameGraphs(renderer.device)
+    inside: list[str] = []
+
+    def show(rays: Rays, marched: int, kept: int) -> tuple[Tensor, Tensor]:
+        with DeviceWaits() as waits:
+            shown = renderer._fixed(rays, marched, kept)
+        inside.extend(waits.found)
+        return shown
+
+    triton = pytest.importorskip("triton")
+    if not triton.knobs.runtime.interpret:
+        pytest.skip("triton was imported before it could be told to interpret")
+    from dnerf import kernels
+
+    with kernels.use_backend("triton"):
+        view = replace(camera(renderer.device), intrinsics=Intrinsics(4, 3, 5.0, 5.0))
+        graphs.picture(view, 0.5, chunk=100, state=0, show=show)
+        inside.clear()
+        graphs.picture(view, 0.5, chunk=100, state=0, show=show)
+    assert inside == []
+
+
+def test_copies_record_anew() -> None:
+    graphs = FrameGraphs(torch.device("cpu"))
+    assert copy.deepcopy(graphs) is not graphs
+    assert copy.deepcopy(trained()) is not None
+
+
+@pytest.mark.gpu
+def test_replayed_pictures_are_those_of_walked_rays() -> None:
+    renderer, plain = trained("cuda", graphs=True), trained("cuda")
+    for time, angle in ((0.0, 0.0), (0.3, 1.0), (0.6, 1.5), (0.9, 2.0)):
+        view = camera(renderer.device, angle)
+        picture, expected = renderer.render_image(view, time), plain.render_image(view, time)
+        torch.testing.assert_close(picture.rgb, expected.rgb, rtol=0, atol=0.01)
+    assert float(picture.opacity.max()) > 0.2
+    with torch.no_grad():
+        for parameter in renderer.field.canonical.parameters():  # type: ignore[union-attr]
+            parameter.zero_()
+    assert float((renderer.render_image(view, 0.9).rgb - picture.rgb).abs().max()) > 0.01
+    moved = renderer.to("cpu").to("cuda")
+    assert torch.isfinite(moved.render_image(view, 0.9).rgb).all()

@@ -1,0 +1,186 @@
+"""Steps of a fixed size: nothing in them waits for a device, and they learn what other steps learn."""
+
+from contextlib import nullcontext
+
+import pytest
+import torch
+from device_waits import DeviceWaits
+from fixed_models import LOSSES, losses, small_renderer
+
+from dnerf import kernels
+from dnerf.data import Frames, SyntheticData
+from dnerf.graphs import GraphCache
+from dnerf.renderer import Renderer
+from dnerf.samplers import StratifiedSampler
+from dnerf.scenes import make_scene
+from dnerf.steps import ROUND_TO, Steps, rays_that_fit
+from dnerf.training import Trainer
+
+
+@pytest.fixture(scope="module")
+def frames() -> Frames:
+    return SyntheticData(make_scene("walker"), 16, num_train=6).frames("train")
+
+
+def steps(renderer: Renderer, frames: Frames, seed: int = 0, *, replays: bool = False, fixed: int = 4096) -> Steps:
+    device = renderer.device
+    trainer = Trainer(learning_rates={"": 1e-3}, orthogonal=["field.deformation"])
+    optimizer = trainer.optimizer(renderer)
+    generator = torch.Generator(device).manual_seed(seed)
+    renderer.train()
+    renderer.sampler.fix_sizes(2 * fixed, fixed)
+    graphs = None
+    if replays:
+        if device.type == "cuda":
+            optimizer.make_capturable()
+        graphs = GraphCache(device, [generator], list(renderer.parameters()))
+    every = {"elastic": 2, "steady": 4, "hidden_matter": 4}
+    return Steps(
+        renderer, renderer, frames.to(device), optimizer, generator, losses=losses(), loss_every=every, shows=True,
+        fixed=fixed, graphs=graphs,
+    )  # fmt: skip
+
+
+def pixels(frames: Frames, count: int, seed: int, device: torch.device) -> torch.Tensor:
+    return torch.randint(frames.num_pixels, (count,), generator=torch.Generator().manual_seed(seed)).to(device)
+
+
+def weights(renderer: Renderer) -> torch.Tensor:
+    return torch.cat([p.detach().flatten().cpu() for p in renderer.parameters()])
+
+
+@pytest.mark.parametrize("splits", [1, 2])
+def test_a_step_waits_for_no_device(frames: Frames, splits: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All losses at once, forward, backward and optimiser, with the kernels that a GPU takes."""
+    triton = pytest.importorskip("triton")
+    if not (torch.cuda.is_available() or triton.knobs.runtime.interpret):
+        pytest.skip("no GPU, and triton was imported before it could be told to interpret")
+    renderer = small_renderer(device="cuda" if torch.cuda.is_available() else "cpu")
+    renderer.sampler.set_progress(1.0 if splits == 2 else 0.0)
+    taken = steps(renderer, frames, fixed=64)
+    with kernels.use_backend("triton"):
+        indices = pixels(frames, 8, 0, renderer.device)
+        taken(indices, 4, 1.0, nullcontext)
+        with DeviceWaits() as waits:
+            terms = taken._optimize(indices, list(LOSSES), 1.0)
+    assert terms.keys() >= set(LOSSES)
+    assert waits.found == []
+
+
+def test_an_update_waits_for_no_device(frames: Frames) -> None:
+    renderer = small_renderer()
+    probes = renderer.sampler.probes(16)
+    assert probes is not None
+    with kernels.use_backend("reference"), DeviceWaits() as waits:
+        renderer.field.density(probes[:, :3], probes[:, 3])  # the grid's definition makes tensors of its levels
+        known = list(waits.found)
+        renderer.learn(probes)
+    assert waits.found == known * 2
+
+
+def test_waits_are_noticed() -> None:
+    values = torch.arange(4.0)
+    with DeviceWaits() as waits:
+        float(values.sum())
+        values[values > 1].sum()
+        values.nonzero()
+        torch.tensor([1.0])
+        torch.repeat_interleave(torch.tensor([1, 2]), output_size=3)
+    assert set(waits.found) == {"_local_scalar_dense", "index", "nonzero", "lift_fresh"}
+
+
+def test_fixed_places_teach_what_others_teach(frames: Frames) -> None:
+    """The same gradients, where all that is wanted fits."""
+    free, fixed = small_renderer(filter_joins=1).train(), small_renderer().train()
+    fixed.sampler.fix_sizes(40000, 20000)
+    indices = pixels(frames, 100, 1, torch.device("cpu"))
+    for progress in (0.0, 1.0):
+        for renderer in (free, fixed):
+            renderer.sampler.set_progress(progress)
+            renderer.zero_grad()
+            rendering = renderer(frames.pixels(indices)[0], generator=torch.Generator().manual_seed(5))
+            rendering.rgb.square().sum().backward()
+        assert 0 < fixed.sampler.fullness() < 1
+        for (name, a), (_, b) in zip(free.named_parameters(), fixed.named_parameters(), strict=True):
+            torch.testing.assert_close(a.grad, b.grad, rtol=2e-3, atol=1e-5 * float(a.grad.abs().max()), msg=name)
+    seen, unseen = free.sampler.get_buffer("maxima"), fixed.sampler.get_buffer("maxima")
+    torch.testing.assert_close(unseen[seen > 1e-2], seen[seen > 1e-2], rtol=0.2, atol=0)
+
+
+def test_graphs_on_a_cpu_are_the_work_itself(frames: Frames) -> None:
+    models = [small_renderer(), small_renderer()]
+    for model, replays in zip(models, (False, True), strict=True):
+        taken = steps(model, frames, replays=replays)
+        for number in range(1, 6):
+            taken(pixels(frames, 64, number, torch.device("cpu")), number, 1.0, nullcontext)
+            taken.update(16 * number)
+    assert torch.equal(weights(models[0]), weights(models[1]))
+
+
+@pytest.mark.parametrize(
+    ("fullness", "rays"), [(0.9, 5000), (0.8, 5000), (0.4, 11008), (0.1, 19968), (1.5, 2816), (9.0, 1024), (0.0, 19968)]
+)
+def test_rays_follow_how_full_places_are(fullness: float, rays: int) -> None:
+    assert rays_that_fit(5000, fullness, 1 << 20) == rays
+
+
+def test_rays_have_bounds() -> None:
+    assert rays_that_fit(5000, 0.1, 6000) == 6000 // ROUND_TO * ROUND_TO
+    assert rays_that_fit(300, 5.0, 6000) == ROUND_TO
+
+
+def test_training_with_fixed_places_learns(frames: Frames) -> None:
+    renderer, seen = small_renderer(), []
+    trainer = Trainer(
+        num_steps=128, num_rays=256, target_samples=16384, graphs=True, learning_rates={"": 1e-2}, losses=losses(),
+        progress_bar=False, log_every=16,
+    )  # fmt: skip
+    trainer.fit(renderer, frames, callbacks=[lambda record, _: seen.append(record)])
+    assert seen[-1].losses["rgb"] < 0.7 * seen[0].losses["rgb"]
+    assert {record.num_rays % ROUND_TO for record in seen} == {0}
+    assert all(0.3 * 16384 < record.num_samples < 1.3 * 16384 for record in seen[4:])
+    assert renderer.sampler.settings[0] is None
+
+
+def test_what_has_no_fixed_size_is_refused(frames: Frames) -> None:
+    with pytest.raises(ValueError, match="target_samples must be given with graphs"):
+        Trainer(graphs=True)
+    renderer = small_renderer()
+    renderer.sampler = StratifiedSampler(8)
+    with pytest.raises(ValueError, match="StratifiedSampler cannot place samples in a fixed number of places"):
+        Trainer(graphs=True, target_samples=100, num_steps=1).fit(renderer, frames)
+
+
+@pytest.mark.gpu
+def test_replayed_steps_are_steps(frames: Frames) -> None:
+    models = [small_renderer(device="cuda"), small_renderer(device="cuda")]
+    found = []
+    for model, replays in zip(models, (False, True), strict=True):
+        taken = steps(model, frames, replays=replays)
+        terms = []
+        for number in range(1, 41):
+            taken.renderer.set_progress(number / 40)
+            taken.optimizer.set_rates(1.0)
+            scalars, _ = taken(pixels(frames, 256, number, model.device), number, 1.0, nullcontext)
+            terms.append({name: float(value) for name, value in scalars.items()})
+            taken.update(number)
+        found.append(terms)
+    assert [terms.keys() for terms in found[0]] == [terms.keys() for terms in found[1]]
+    # Sums by atomic additions come in any order.
+    for a, b in zip(*found, strict=True):
+        assert a["mse"] == pytest.approx(b["mse"], rel=2e-2)
+    difference = (weights(models[0]) - weights(models[1])).norm()
+    start = weights(small_renderer())
+    assert difference < 0.2 * (weights(models[0]) - start).norm()
+
+
+@pytest.mark.gpu
+def test_training_replays_on_a_gpu(frames: Frames) -> None:
+    renderer = small_renderer(device="cuda")
+    trainer = Trainer(
+        num_steps=300, num_rays=256, target_samples=4096, graphs=True, learning_rates={"": 1e-2}, losses=losses(),
+        loss_every={"elastic": 2, "steady": 4, "hidden_matter": 4}, progress_bar=False, log_every=20,
+    )  # fmt: skip
+    seen = []
+    trainer.fit(renderer, frames, callbacks=[lambda record, _: seen.append(record)])
+    assert seen[-1].losses["rgb"] < 0.3 * seen[0].losses["rgb"]
