@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from dnerf.data.frames import Frames, composite_on
 from dnerf.graphs import GraphCache
-from dnerf.losses import Loss
 from dnerf.optimizers import AdamMuon
 from dnerf.recovery import what_is_shown
 from dnerf.renderer import Renderer
@@ -29,7 +28,7 @@ class Steps:
         frames: with the pixels to learn from, on the renderer's device.
         optimizer: of the parameters.
         generator: of all randomness.
-        losses: terms by name.
+        losses: terms by name, called as `Loss` is.
         loss_every: by name, steps between a term's turns, in which it counts as many times.
         shows: whether it is asked how much batches show, see `what_is_shown`.
         fixed: samples for which the sampler has places, if their number is fixed.
@@ -44,7 +43,7 @@ class Steps:
         optimizer: AdamMuon,
         generator: torch.Generator,
         *,
-        losses: Mapping[str, Loss],
+        losses: Mapping[str, nn.Module],
         loss_every: Mapping[str, int],
         shows: bool,
         fixed: int | None = None,
@@ -60,7 +59,7 @@ class Steps:
         self.shows = shows
         self.fixed = fixed
         self.graphs = graphs
-        self._num_samples = 0
+        self._num_samples = fixed or 0
 
     def __call__(
         self, indices: Tensor, number: int, weight: float, randomness: Callable[[], AbstractContextManager[None]]

@@ -181,8 +181,7 @@ class Trainer:
             run.data = fingerprint(frames)
         renderer.train()
         places = self._places(processes)
-        if places is not None:
-            renderer.sampler.fix_sizes(int(self.marched_per_sample * places), places)
+        renderer.sampler.fix_sizes(None if places is None else int(self.marched_per_sample * places), places)
         self._warm_up(renderer, frames)
         if resume and checkpoints is not None:
             self._restore(run, checkpoints, processes)
@@ -293,7 +292,7 @@ class Trainer:
             graphs = GraphCache(renderer.device, [run.generator], list(renderer.parameters()))
         return Steps(
             model, renderer, frames, run.optimizer, run.generator,
-            losses={name: loss for name, loss in self.losses.items() if isinstance(loss, Loss)},
+            losses=dict(self.losses.items()),
             loss_every=self.loss_every, shows=self.recovery is not None,
             fixed=self._places(processes), graphs=graphs,
         )  # fmt: skip

@@ -1,6 +1,7 @@
 """Steps of a fixed size: nothing in them waits for a device, and they learn what other steps learn."""
 
 from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +11,9 @@ from fixed_models import LOSSES, losses, small_renderer
 from dnerf import kernels
 from dnerf.data import Frames, SyntheticData
 from dnerf.graphs import GraphCache
+from dnerf.records import Callback, TrainingRecord
 from dnerf.renderer import Renderer
+from dnerf.run_state import CheckpointFolder
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
 from dnerf.steps import ROUND_TO, Steps, rays_that_fit
@@ -140,6 +143,26 @@ def test_training_with_fixed_places_learns(frames: Frames) -> None:
     assert {record.num_rays % ROUND_TO for record in seen} == {0}
     assert all(0.3 * 16384 < record.num_samples < 1.3 * 16384 for record in seen[4:])
     assert renderer.sampler.settings[0] is None
+
+
+def test_training_with_fixed_places_is_continued_bit_for_bit(frames: Frames, tmp_path: Path) -> None:
+    def broken(record: TrainingRecord, _: Renderer) -> None:
+        if record.step == 44:
+            raise KeyboardInterrupt
+
+    def trained(folder: str, *callbacks: Callback) -> Renderer:
+        renderer = small_renderer()
+        trainer = Trainer(
+            num_steps=60, num_rays=256, target_samples=8192, graphs=True, losses=losses(), progress_bar=False,
+            loss_every={"steady": 3}, log_every=4, checkpoint_every=20,
+        )  # fmt: skip
+        checkpoints = CheckpointFolder(tmp_path / folder)
+        trainer.fit(renderer, frames, callbacks=callbacks, checkpoints=checkpoints, resume=True)
+        return renderer
+
+    with pytest.raises(KeyboardInterrupt):
+        trained("broken", broken)
+    assert torch.equal(weights(trained("broken")), weights(trained("whole")))
 
 
 def test_what_has_no_fixed_size_is_refused(frames: Frames) -> None:
