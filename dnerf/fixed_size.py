@@ -44,7 +44,6 @@ def spread(wanted: Tensor, size: int) -> tuple[Tensor, Tensor]:
     ends = wanted.cumsum(0)
     filled = torch.where(ends <= size, wanted, 0)
     before = torch.nn.functional.pad(filled.cumsum(0), (1, 0))
-    # Not a slice of one element, whose size some would have to be told.
     left = size - before[-1]
     number = torch.arange(len(before), device=wanted.device)
     return filled, before + number * left // len(wanted)

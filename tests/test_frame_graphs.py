@@ -1,6 +1,7 @@
 """Pictures in a fixed number of places: the same as others, in any chunks, for any view and time."""
 
 import copy
+import pickle
 from dataclasses import replace
 
 import pytest
@@ -108,9 +109,15 @@ def test_a_picture_waits_once() -> None:
 
 
 def test_copies_record_anew() -> None:
-    graphs = FrameGraphs(torch.device("cpu"))
-    assert copy.deepcopy(graphs) is not graphs
-    assert copy.deepcopy(trained()) is not None
+    """Graphs cannot be copied: they refer to one model's memory."""
+    renderer = trained()
+    renderer._frames = FrameGraphs(renderer.device)
+    pictured(renderer._frames, renderer, camera(renderer.device), 0.5)
+    assert renderer._frames._sizes
+    for copied in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer._frames))):  # noqa: S301
+        frames = copied._frames if isinstance(copied, Renderer) else copied
+        assert isinstance(frames, FrameGraphs)
+        assert not frames._sizes
 
 
 @pytest.mark.gpu

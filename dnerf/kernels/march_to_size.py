@@ -46,7 +46,7 @@ def march_to_size(
     dtype = torch.promote_types(origins.dtype, torch.float32)
     rays = [x.to(dtype) for x in (origins, directions, near, far, times, jitter)]
     if choose(rays[0]) == "triton":
-        *columns, wanted = torch.ops.dnerf.march_to_size(*rays, occupancy, aabb.to(dtype), step.to(dtype), size)
+        *columns, wanted = torch.ops.dnerf.march_to_size(occupancy, rays, aabb.to(dtype), step.to(dtype), size)
         return MarchedSamples(*columns), wanted
     marched = march(
         origins, directions, near, far, times=times, jitter=jitter, occupancy=occupancy, aabb=aabb, step=float(step)
@@ -68,36 +68,16 @@ def fitted(marched: MarchedSamples, size: int) -> tuple[MarchedSamples, Tensor]:
 
 @torch.library.custom_op("dnerf::march_to_size", mutates_args=())
 def _march_to_size(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: Tensor,
-    size: int,
+    occupancy: Tensor, rays: list[Tensor], aabb: Tensor, step: Tensor, size: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    return run_compiled(
-        "march", "march_to_size", origins, directions, near, far, times, jitter, occupancy, aabb, step, size
-    )
+    return run_compiled("march", "march_to_size", occupancy, rays, aabb, step, size)
 
 
 @_march_to_size.register_fake
 def _(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: Tensor,
-    size: int,
+    occupancy: Tensor, rays: list[Tensor], aabb: Tensor, step: Tensor, size: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    starts = origins.new_empty(size)
-    indices = origins.new_empty(size, dtype=torch.int64)
-    offsets = indices.new_empty(near.shape[0] + 1)
+    starts = rays[0].new_empty(size)
+    indices = starts.new_empty(size, dtype=torch.int64)
+    offsets = indices.new_empty(rays[0].shape[0] + 1)
     return starts, starts.clone(), indices, offsets, indices.new_empty(())

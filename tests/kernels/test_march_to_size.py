@@ -47,9 +47,9 @@ def test_registered_op(compiled):
     arguments = on(compiled, rays(20) | {"occupancy": grid(), "aabb": BOX})
     if compiled == "cpu" and kernels.get_backend() == "numba":
         pytest.skip("marched by `march`")
-    names = ("origins", "directions", "near", "far", "times", "jitter", "occupancy", "aabb")
-    values = [arguments[name] for name in names]
-    torch.library.opcheck(torch.ops.dnerf.march_to_size, (*values, STEP.to(compiled), 100))
+    columns = [arguments[name] for name in ("origins", "directions", "near", "far", "times", "jitter")]
+    op = torch.ops.dnerf.march_to_size
+    torch.library.opcheck(op, (arguments["occupancy"], columns, arguments["aabb"], STEP.to(compiled), 100))
 
 
 @pytest.mark.parametrize(

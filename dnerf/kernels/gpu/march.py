@@ -31,7 +31,8 @@ def march(
     max_samples_per_ray: int | None,
     skips: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    arguments = _arguments(origins, directions, near, far, times, jitter, occupancy, aabb, near.new_full((1,), step))
+    rays = [origins, directions, near, far, times, jitter]
+    arguments = _arguments(rays, occupancy, aabb, near.new_full((1,), step))
     limit = torch.iinfo(torch.int64).max if max_samples_per_ray is None else max_samples_per_ray
     num_rays, offsets = len(near), torch.zeros(len(near) + 1, dtype=torch.int64, device=near.device)
     if num_rays:
@@ -48,18 +49,10 @@ def march(
 
 
 def march_to_size(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: Tensor,
-    size: int,
+    occupancy: Tensor, rays: list[Tensor], aabb: Tensor, step: Tensor, size: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    arguments = _arguments(origins, directions, near, far, times, jitter, occupancy, aabb, step.reshape(1))
+    near = rays[2]
+    arguments = _arguments(rays, occupancy, aabb, step.reshape(1))
     ranges, limit = arguments[RANGES], torch.iinfo(torch.int64).max
     num_rays, counts = len(near), torch.zeros(len(near) + 1, dtype=torch.int64, device=near.device)
     _march[(num_rays,)](*arguments, limit, counts, near, near, counts, *occupancy.shape, False, BLOCK, **OPTIONS)
@@ -73,18 +66,9 @@ def march_to_size(
     return starts, ends, indices, offsets, wanted.sum()
 
 
-def _arguments(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: Tensor,
-) -> tuple[Tensor, ...]:
-    """What the kernel reads; `step` is (1,)."""
+def _arguments(rays: list[Tensor], occupancy: Tensor, aabb: Tensor, step: Tensor) -> tuple[Tensor, ...]:
+    """What the kernel reads, of origins, directions, near, far, times and jitter; `step` is (1,)."""
+    origins, directions, near, far, times, jitter = rays
     return (
         origins.contiguous(),
         directions.contiguous(),
