@@ -442,3 +442,17 @@ def test_rays_that_do_not_fit_have_no_samples() -> None:
     last = samples.ray_indices[samples.lengths > 0].max()
     is_same = (everything.ray_indices <= last) & (everything.lengths > 0)
     assert torch.equal(samples.starts[samples.lengths > 0], everything.starts[is_same])
+
+
+def test_empty_places_are_neither_kept_nor_observed() -> None:
+    """They lie at the rays' origins, where this fog is, too."""
+    sampler = small(margin=0).train()
+    inside = torch.zeros_like(sampler.occupied)
+    inside[:, 6:10, 6:10, 6:10] = True
+    sampler.occupy(inside)
+    before = sampler.maxima.clone()
+    samples, wanted = sampler.to_size(rays_towards_origin(50), fog(5.0), 1 << 12, 1 << 12, min_weight=0.0)
+    assert 0 < int(wanted[0]) < 1 << 12
+    assert int(wanted[1]) == int(wanted[0]) == int((samples.lengths > 0).sum())
+    assert torch.equal(sampler.maxima[~inside], before[~inside])
+    assert sampler.maxima[inside].max() == 5
