@@ -221,6 +221,8 @@ class Trainer:
         while not self._is_finished(run):
             begin = time.perf_counter()
             outcome = self._step(run, renderer, steps, processes)
+            if renderer.device.type == "cuda" and self._is_looked_at(run.step + 1):
+                torch.cuda.synchronize(renderer.device)  # looking stops the clock, not what is still at work
             seconds = run.seconds + time.perf_counter() - begin
             run.seconds, num_samples, signal = processes.agree(seconds, outcome.num_samples, request.number)
             run.step += 1
@@ -232,8 +234,7 @@ class Trainer:
             run.rays_done, run.num_rays = run.rays_done + used_rays, max(wanted_rays, processes.size)
             ends = self._is_finished(run)
             saves = checkpoints is not None and bool(ends or signal or self._is_due(run.step))
-            # What is saved has been looked at.
-            if saves or run.step == 1 or ends or run.step % self.log_every == 0:
+            if ends or signal or self._is_looked_at(run.step):
                 record = self._examined(run, outcome, processes, used_rays, num_samples)
                 if record is None:
                     steps.forget()
@@ -333,6 +334,10 @@ class Trainer:
 
     def _is_finished(self, run: RunState) -> bool:
         return run.step >= self.num_steps or (self.max_seconds is not None and run.seconds >= self.max_seconds)
+
+    def _is_looked_at(self, step: int) -> bool:
+        """What is saved is."""
+        return step in (1, self.num_steps) or step % self.log_every == 0 or self._is_due(step)
 
     def _is_due(self, step: int) -> bool:
         return self.checkpoint_every is not None and step % self.checkpoint_every == 0

@@ -130,4 +130,4 @@ def test_rates_on_the_device_take_the_same_steps() -> None:
         assert {isinstance(group["lr"], torch.Tensor) for group in optimizer.param_groups} == {is_capturable}
         runs.append(shared)
     for a, b in zip(*runs, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)  # steps of 0.1; their roots are taken in another order

@@ -9,8 +9,10 @@ from device_waits import DeviceWaits
 from fixed_models import LOSSES, losses, small_renderer
 
 from dnerf import kernels
+from dnerf.compositing import Rendering
 from dnerf.data import Frames, SyntheticData
 from dnerf.graphs import GraphCache
+from dnerf.losses import Loss
 from dnerf.records import Callback, TrainingRecord
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder
@@ -207,3 +209,22 @@ def test_training_replays_on_a_gpu(frames: Frames) -> None:
     seen = []
     trainer.fit(renderer, frames, callbacks=[lambda record, _: seen.append(record)])
     assert seen[-1].losses["rgb"] < 0.3 * seen[0].losses["rgb"]
+
+
+@pytest.mark.gpu
+def test_the_clock_waits_for_the_device(frames: Frames) -> None:
+    """Records are made outside of the clock, but what a step left to the device is training."""
+
+    class Slow(Loss):
+        def forward(self, rendering: Rendering, target: torch.Tensor, renderer: Renderer) -> torch.Tensor:
+            torch.cuda._sleep(200_000_000)
+            return (rendering.rgb - target).square().mean()
+
+    ends = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
+    ends[0].record()
+    torch.cuda._sleep(200_000_000)
+    ends[1].record()
+    torch.cuda.synchronize()
+    trainer = Trainer(num_steps=5, num_rays=64, losses={"slow": Slow()}, log_every=1, progress_bar=False)
+    record = trainer.fit(small_renderer(device="cuda"), frames)
+    assert record.seconds > 0.8 * 5e-3 * ends[0].elapsed_time(ends[1])
