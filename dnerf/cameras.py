@@ -70,13 +70,19 @@ class Intrinsics:
             center_y=None if self.center_y is None else self.center_y * scale_y,
         )
 
-    def pixel_directions(self, columns: Tensor, rows: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Directions in camera space with z = -1: (...,) integer pixels -> (..., 3)."""
+    @property
+    def lens(self) -> tuple[float, float, float, float]:
+        """Focal lengths along x and y, principal column and row; the rays of pixels go through whole numbers."""
         offset = PIXEL_OFFSETS[self.pixel_origin]
         center_x = 0.5 * self.width if self.center_x is None else self.center_x
         center_y = 0.5 * self.height if self.center_y is None else self.center_y
-        x = (columns.to(dtype) + (offset - center_x)) / self.focal_x
-        y = (center_y - offset - rows.to(dtype)) / self.focal_y
+        return self.focal_x, self.focal_y, center_x - offset, center_y - offset
+
+    def pixel_directions(self, columns: Tensor, rows: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Directions in camera space with z = -1: (...,) integer pixels -> (..., 3)."""
+        focal_x, focal_y, column, row = self.lens
+        x = (columns.to(dtype) - column) / focal_x
+        y = (row - rows.to(dtype)) / focal_y
         return torch.stack([x, y, -torch.ones_like(x)], dim=-1)
 
 
@@ -145,37 +151,12 @@ class Camera:
             depth: (...,) z-depth in world units, negative behind the camera.
         """
         check_last_axis("positions", positions, 3)
-        camera, pose = self.intrinsics, self.pose.to(positions.dtype)
+        pose = self.pose.to(positions.dtype)
         offsets = (positions - pose[:3, 3]).unbind(-1)
         x, y, z = (_product(offsets, pose[:3, axis]) for axis in range(3))
         depth = -z
-        offset = PIXEL_OFFSETS[camera.pixel_origin]
-        center_x = 0.5 * camera.width if camera.center_x is None else camera.center_x
-        center_y = 0.5 * camera.height if camera.center_y is None else camera.center_y
-        columns = x / depth * camera.focal_x + (center_x - offset)
-        rows = center_y - offset - y / depth * camera.focal_y
-        return torch.stack([columns, rows], dim=-1), depth
-
-    def rectangles_around(self, groups: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The rectangles of pixels that groups of points span on the picture.
-
-        The rays that hit the convex hull of a group go through its rectangle.
-
-        Args:
-            groups: (M, K, 3) world positions.
-
-        Returns:
-            First row and column of each, (2, M) int64, and the row and column behind it, (2, M); None if a point does
-            not lie before the camera.
-        """
-        positions, depth = self.project(groups.transpose(0, 1))
-        if not bool((depth > 0).all() & positions.isfinite().all()):
-            return None
-        # Cut off while they are floats: what lies far beyond the picture may have no number.
-        most = positions.new_tensor([self.intrinsics.width, self.intrinsics.height])
-        low = torch.minimum(positions.amin(0).floor().clamp(min=0), most).long()
-        end = torch.minimum(positions.amax(0).ceil().clamp(min=-1) + 1, most).long()
-        return low.T.flip(0), end.T.flip(0)
+        focal_x, focal_y, column, row = self.intrinsics.lens
+        return torch.stack([x / depth * focal_x + column, row - y / depth * focal_y], dim=-1), depth
 
     def rays(self, time: float, pixels: Tensor | None = None) -> Rays:
         """Rays of pixels at one time.

@@ -257,14 +257,15 @@ class Renderer(nn.Module):
 
     def _walked(self, camera: Camera, time: float, chunk: int) -> Tensor:
         """A picture (P, 5) whose rays end where they are opaque."""
-        seen = self.sampler.seen_pixels(camera, time)
+        seen = self.sampler.seen_rays(camera, time)
+        numbers, rays = (None, camera.rays(time)) if seen is None else seen
         field = self.field.at_time(time)
-        parts = list(self._in_chunks(camera.rays(time, seen), field, chunk, self._tracer(field, camera, time)))
+        parts = list(self._in_chunks(rays, field, chunk, self._tracer(field, camera, time)))
         columns = [_columns(part) for part in parts]
-        if seen is None:
+        if numbers is None:
             return torch.cat(columns)
         picture = self._empty(camera, time)
-        for pixels, column in zip(seen.split([len(c) for c in columns]), columns, strict=True):
+        for pixels, column in zip(numbers.split([len(c) for c in columns]), columns, strict=True):
             picture[pixels] = column
         return picture
 

@@ -356,9 +356,11 @@ def test_a_picture_of_pixels_that_may_see_something_is_that_of_all(background: n
     renderer = Renderer(trained_field(), sampler, background, stop_transmittance=1e-3)
     camera = some_camera(40, 30)
     quick = renderer.render_image(camera, 0.6, chunk=100)
-    assert len(sampler.seen_pixels(camera, 0.6)) < 40 * 30
-    sampler.seen_pixels = lambda camera, time: None
+    assert len(sampler.seen_rays(camera, 0.6)[0]) < 40 * 30
+    sampler.seen_rays = lambda camera, time: None
     whole = renderer.render_image(camera, 0.6, chunk=100)
     for name in ("rgb", "opacity", "depth"):
-        torch.testing.assert_close(getattr(quick, name), getattr(whole, name), rtol=0, atol=2e-6)
+        torch.testing.assert_close(
+            getattr(quick, name), getattr(whole, name), rtol=0, atol=1e-5
+        )  # distances, from where rays are cut short
     assert bool(whole.opacity.any()) == bool(share)

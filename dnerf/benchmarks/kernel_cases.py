@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from dnerf.benchmarks.plain_kernels import corner_rows, plain_grid_encode, plain_packed_weights
 from dnerf.benchmarks.suite import Settings
+from dnerf.cameras import Camera, Intrinsics, look_at
 from dnerf.geometry import cube_corners
 from dnerf.kernels import (
     FrameTables,
@@ -17,6 +19,7 @@ from dnerf.kernels import (
     brick_lookup,
     covered_places,
     few_nonzero,
+    footprints,
     grid_encode,
     march,
     packed_sum,
@@ -42,7 +45,7 @@ SPACING = 0.06  # along a ray, of samples whose deformation is asked
 WIDTHS = (32, 128, 128, 128, 128)  # of the network of a deformation
 LATTICE = 384  # cells per side of the bricks' lattice
 CONTENTS = 16  # numbers of each of its vertices
-DISPLACEMENTS = 96  # cells per side of the displacements' lattice
+DISPLACEMENTS = 80  # cells per side of the displacements' lattice
 
 Call = Callable[[], Any]
 
@@ -183,6 +186,10 @@ class Workload:
         # Vertices of the displacements' lattice around them.
         lows, ends = cells * DISPLACEMENTS // len(occupied), -(-(cells + 1) * DISPLACEMENTS // len(occupied)) + 1
         around = covered_places(lows, ends, (DISPLACEMENTS + 1,) * 3)
+        camera = Camera(Intrinsics.from_angle(400, 400, 0.7), look_at((2.5, 2.5, 1.5)))
+        view = partial(footprints, occupied, self.box, camera.pose, camera.intrinsics.lens, (400, 400))
+        covered = view()
+        seen = 0 if covered is None else len(covered.pixels)
         times = self.rays.times[self.marched.ray_indices]
         layers = sum(x.nbytes for x in self.layers) // 2
         activations = self.num_samples * (2 * WIDTHS[0] + 2 * WIDTHS[-1])
@@ -206,6 +213,7 @@ class Workload:
                 _backends(lambda: covered_places(lows, ends, (DISPLACEMENTS + 1,) * 3)),
                 lows.nbytes + ends.nbytes + around.nbytes,
             ),
+            Case("footprints", "forward", _backends(view), occupied.nbytes + 16 * seen),
             Case("trace", "forward", _backends(self._tracer()), 10 * 4 * len(self.rays) + contents),
             *_both(
                 "relu_layers",

@@ -4,6 +4,7 @@ from .backend import BACKENDS, get_backend, set_backend, use_backend
 from .brick_lookup import brick_lookup
 from .covered_places import covered_places
 from .few_nonzero import few_nonzero
+from .footprints import Footprints, footprints
 from .grid_encode import GridLevels, grid_encode
 from .march import MarchedSamples, MarchGrid, march
 from .march_to_size import march_to_size
@@ -16,6 +17,7 @@ from .trace import FrameTables, trace
 
 __all__ = [
     "BACKENDS",
+    "Footprints",
     "FrameTables",
     "GridLevels",
     "MarchGrid",
@@ -23,6 +25,7 @@ __all__ = [
     "brick_lookup",
     "covered_places",
     "few_nonzero",
+    "footprints",
     "get_backend",
     "grid_encode",
     "march",

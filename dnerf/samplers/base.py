@@ -57,7 +57,7 @@ class Sampler(nn.Module, ABC):
         """
         return samples
 
-    def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
+    def seen_rays(self, camera: Camera, time: float) -> tuple[Tensor, Rays] | None:
         """Pixels of a view in whose rays this sampler may place samples in evaluation mode; all unless overridden.
 
         Args:
@@ -65,7 +65,8 @@ class Sampler(nn.Module, ABC):
             time: of the frame, in [0, 1].
 
         Returns:
-            Their numbers (P,) int64, `row * width + column`, in order; None for all.
+            Their numbers (P,) int64, `row * width + column`, in order, and their rays, which may be cut short where
+            they meet nothing, by whole intervals; None for all of them.
         """
         return None
 

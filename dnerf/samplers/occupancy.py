@@ -1,6 +1,7 @@
 """Occupancy-guided packed sampling: empty space, at the time of the ray, costs nothing."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -9,8 +10,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_positive
 from dnerf.compositing import render_weights
 from dnerf.fields.base import RadianceField
-from dnerf.geometry import cube_corners
-from dnerf.kernels import MarchGrid, covered_places, few_nonzero, march, march_to_size
+from dnerf.kernels import MarchGrid, footprints, march, march_to_size
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.samplers.visibility import joined, visible_weights
@@ -18,6 +18,7 @@ from dnerf.samplers.visibility import joined, visible_weights
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
 MOST_AT_ONCE = 1 << 16  # samples that the filter asks, where many rays meet haze: about 50 MiB in the networks' layers
+ROOM = 2  # intervals left before and behind covering cells: those kept are whole, whatever rounding does
 
 
 class OccupancySampler(OccupancyGrid):
@@ -260,23 +261,25 @@ class OccupancySampler(OccupancyGrid):
         return MarchGrid(occupied[slab], skips[slab], self.box, self.step_size, self.render_splits, self.split_weight)
 
     @torch.no_grad()
-    def seen_pixels(self, camera: Camera, time: float) -> Tensor | None:
-        """Pixels inside the rectangles that occupied cells cover on the picture; all if a cell lies beside the camera.
+    def seen_rays(self, camera: Camera, time: float) -> tuple[Tensor, Rays] | None:
+        """Pixels that occupied cells cover, see `footprints`, and their rays; all if a cell lies beside the camera.
 
-        So a frame costs what the body covers, not what the picture holds. No pixel is lost: cells are convex, so the
-        rectangle around a cell's corners holds all of it.
+        So a frame costs what the body covers, not what the picture holds. Rays begin and end, a whole number of
+        intervals away from where they did, before and behind the cells that cover them: their intervals stay, up to
+        rounding.
         """
-        occupied = self.grid_at(time, camera.pose.dtype).occupancy
-        corners = []
-        for axis, cell in enumerate(torch.unravel_index(few_nonzero(occupied), occupied.shape)):
-            unit = torch.linspace(0, 1, occupied.shape[axis] + 1, device=cell.device)
-            faces = torch.lerp(self.box[0, axis], self.box[1, axis], unit)
-            corners.append(faces[cell + cube_corners(cell.device)[:, axis, None]])
-        # In memory axis by axis, and corner by corner: what follows are operations on columns.
-        rectangles = camera.rectangles_around(torch.stack(corners).permute(2, 1, 0))
-        if rectangles is None:
+        grid, lens, view = self.grid_at(time, camera.pose.dtype), camera.intrinsics.lens, camera.intrinsics
+        covered = footprints(grid.occupancy, grid.aabb, camera.pose, lens, (view.height, view.width))
+        if covered is None:
             return None
-        return covered_places(*rectangles, (camera.intrinsics.height, camera.intrinsics.width))
+        rays = camera.rays(time, covered.pixels)
+        lengths = rays.far / camera.far  # of a ray, for each unit of z-depth
+        before, behind = covered.depths.mul_(lengths).sub_(rays.near).div_(grid.step)
+        return covered.pixels, replace(
+            rays,
+            near=before.sub_(ROOM).floor_().clamp_(min=0).mul_(grid.step).add_(rays.near),
+            far=torch.minimum(rays.far, behind.add_(ROOM).ceil_().mul_(grid.step).add_(rays.near)),
+        )
 
     def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
         asked, number = joined(samples, self.filter_joins if self.training_splits == 1 else 1)

@@ -334,7 +334,7 @@ def camera_at(eye: tuple[float, float, float], pixel_origin: str = "center") -> 
 @pytest.mark.parametrize("pixel_origin", ["center", "corner"])
 @pytest.mark.parametrize("density", [0.0, 0.002, 0.05])
 def test_no_pixel_is_lost_that_has_samples(density: float, pixel_origin: str) -> None:
-    """Random cells, random views: what `seen_pixels` leaves out marches through nothing."""
+    """Random cells, random views: what `seen_rays` leaves out marches through nothing."""
     sampler = small(margin=1, render_margin=0).eval()
     left_out = 0
     for seed in range(20):
@@ -342,11 +342,21 @@ def test_no_pixel_is_lost_that_has_samples(density: float, pixel_origin: str) ->
         sampler.occupy(torch.rand(sampler.occupied.shape, generator=generator) < density)
         eye, time = torch.randn(3, generator=generator), float(torch.rand((), generator=generator))
         camera = camera_at(tuple((3 * eye / eye.norm()).tolist()), pixel_origin)
-        seen = sampler.seen_pixels(camera, time)
-        assert seen is not None
+        found = sampler.seen_rays(camera, time)
+        assert found is not None
+        seen, rays = found
         assert torch.equal(seen, seen.unique())
-        hit = sampler(camera.rays(time), fog(1.0)).ray_indices.unique()
-        assert torch.isin(hit, seen).all()
+        whole, cut = sampler(camera.rays(time), fog(1.0)), sampler(rays, fog(1.0))
+        assert torch.isin(whole.ray_indices, seen).all()
+        # Where rays are cut short, intervals stay, up to rounding, which may take a middle across a cell's face.
+        counts = torch.zeros(camera.intrinsics.width * camera.intrinsics.height, dtype=torch.int64)
+        counts[seen] = cut.offsets.diff()
+        same = whole.offsets.diff() == counts
+        assert (~same).sum() <= 3
+        for name in ("starts", "ends"):
+            a, b = getattr(whole, name)[same[whole.ray_indices]], getattr(cut, name)[same[seen][cut.ray_indices]]
+            torch.testing.assert_close(a, b, rtol=0, atol=2e-6)
+        assert (rays.far - rays.near <= (camera.rays(time).far - camera.rays(time).near)[seen] + 1e-6).all()
         left_out += camera.intrinsics.width * camera.intrinsics.height - len(seen)
     assert left_out > 0
 
@@ -357,7 +367,9 @@ def test_one_cell_is_seen_through_its_own_rectangle_only() -> None:
     mask[:, 8, 8, 8] = True
     sampler.occupy(mask)
     camera = camera_at((3.0, 0.0, 0.0))
-    seen = sampler.seen_pixels(camera, 0.3)
+    seen, rays = sampler.seen_rays(camera, 0.3)
+    length = 0.125 * 3**0.5 + 5 * sampler.step_size  # the cell's, and room
+    assert (rays.far - rays.near < length).all()
     corners = torch.cartesian_prod(*[torch.tensor([0.0, 0.125])] * 3)
     columns, rows = camera.project(corners)[0].unbind(-1)
     assert seen.remainder(33).min() >= columns.min() - 1
@@ -368,14 +380,14 @@ def test_one_cell_is_seen_through_its_own_rectangle_only() -> None:
 
 def test_all_pixels_are_seen_from_within_the_grid() -> None:
     sampler = small().eval()
-    assert sampler.seen_pixels(camera_at((0.2, 0.1, 0.3)), 0.5) is None
+    assert sampler.seen_rays(camera_at((0.2, 0.1, 0.3)), 0.5) is None
 
 
 def test_the_grid_of_evaluation_decides_what_is_seen() -> None:
     sampler = small(margin=1, render_margin=0, num_slabs=2).eval()
     sampler.occupied.fill_(True)
     sampler.rendered.fill_(False)
-    assert len(sampler.seen_pixels(camera_at((3.0, 0.0, 0.0)), 0.5)) == 0
+    assert len(sampler.seen_rays(camera_at((3.0, 0.0, 0.0)), 0.5)[0]) == 0
 
 
 @pytest.mark.parametrize("most", [1, 3, 8])
