@@ -96,6 +96,16 @@ def test_times_beyond_the_film_are_finite(name: str) -> None:
     assert torch.isfinite(velocity(positions, times - 1)).all()
 
 
+@pytest.mark.parametrize("name", ["network", "network, relu", "curl", "rigid"])
+def test_no_value_is_asked_for(name: str) -> None:
+    """Nor in the backward pass, which a dispatch mode would divert: CUDA graphs could not record it."""
+    velocity = trained(name)
+    positions, times = points(4)
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        velocity(positions.requires_grad_(), times.requires_grad_()).square().sum().backward()
+    assert not {"aten::item", "aten::nonzero"} & {event.name for event in profile.events()}
+
+
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gradcheck(name: str) -> None:
     velocity = trained(name)

@@ -53,7 +53,9 @@ class BoxWindow(nn.Module):
 
     def forward(self, positions: Tensor) -> Tensor:
         """Factor (..., 1) at positions (..., 3)."""
-        return self._steps(self._depth(positions)).prod(-1, keepdim=True)
+        # Not `prod`, whose backward pass asks the device for zeros.
+        x, y, z = self._steps(self._depth(positions)).split(1, dim=-1)
+        return x * y * z
 
     def inside(self, positions: Tensor) -> Tensor:
         """Positions (..., 3) moved into the box: where the factor is 0, fields are asked at its faces, so that no
