@@ -46,7 +46,7 @@ def run(settings: Settings) -> SuiteResult:
             Table("Means over seeds", means, "psnr_low, psnr_high: worst and best seed. frames: how many were scored."),
             Table("Runs", rows),
         ],
-        plots=[_plot(scene, means) for scene in options["scenes"]],
+        plots=[_plot(scene, means) for scene in options["scenes"] if len(options["seconds"]) > 1],
         findings=_findings(means),
     )
 

@@ -78,6 +78,8 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     assert len(calls) == 17
     assert "trainer.num_steps=20 " in calls[0]
     assert not (tmp_path / "work" / "warm_up").exists()
+    once = Settings(work_dir=tmp_path / "once", train_command=command, options={**options, "seconds": [4]})
+    assert run_training_suite(once).plots == []  # a single budget makes no curve
     wanted = ("experiment=dnerf", "scene=static", "data.resolution=50", "evaluate_split=val", "evaluate_frames=2")
     assert all(word in calls[-1].split() for word in wanted)
     with_few_rays = [call for call in calls if "trainer.num_rays=64" in call.split()]
