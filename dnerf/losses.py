@@ -87,8 +87,8 @@ class HiddenMatterLoss(Loss):
 
     A field invents matter where no training ray reaches (below the ground, inside bodies), and views from elsewhere
     show it. What rays see is left alone: a cell of canonical space in which a sample had a share in a picture within
-    the last `memory` calls costs nothing. Inside opaque matter there is no gradient, `1 - exp(-density length)` is
-    flat there; none reaches the deformation.
+    the last `memory_samples` samples costs nothing. Inside opaque matter there is no gradient,
+    `1 - exp(-density length)` is flat there; none reaches the deformation.
 
     Without effect for samplers that do not know where matter is, see `Sampler.places`.
 
@@ -101,7 +101,8 @@ class HiddenMatterLoss(Loss):
         num_points: places of each step.
         length: of the intervals, in world units.
         resolution: cells along each side of the box.
-        memory: calls after which a cell that had no share in a picture counts as hidden.
+        memory_samples: of the batches it is called with, after which a cell that had no share in a picture counts as
+            hidden. (As many calls would mean more with larger batches.)
 
     Raises:
         ValueError: for numbers that are not positive, or a negative weight; when used, for a field that is not
@@ -116,27 +117,30 @@ class HiddenMatterLoss(Loss):
         *,
         length: float = 0.02,
         resolution: int = 64,
-        memory: int = 256,
+        memory_samples: int = 1 << 20,
     ) -> None:
         super().__init__()
         check_positive("weight", weight, allow_zero=True)
         for name, value in (
-            ("num_points", num_points), ("length", length), ("resolution", resolution), ("memory", memory)
+            ("num_points", num_points), ("length", length), ("resolution", resolution),
+            ("memory_samples", memory_samples),
         ):  # fmt: skip
             check_positive(name, value)
         self.weight = weight
         self.num_points = num_points
         self.length = length
-        self.memory = memory
+        self.memory_samples = memory_samples
         self.register_buffer("box", as_box(box), persistent=False)
         self.register_buffer("num_calls", torch.zeros((), dtype=torch.int64))
-        self.register_buffer("last_seen", torch.full((resolution,) * 3, -memory - 1, dtype=torch.int64))
+        self.register_buffer("num_samples", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("last_seen", torch.full((resolution,) * 3, -memory_samples - 1, dtype=torch.int64))
         # Kronecker's sequence in five dimensions: powers of the root of x^6 = x + 1 (Roberts 2018).
         powers = torch.arange(1, 6, dtype=torch.float64)
         self.register_buffer("generators", PLASTIC**-powers, persistent=False)
         self.box: Tensor
         self.generators: Tensor
         self.num_calls: Tensor
+        self.num_samples: Tensor
         self.last_seen: Tensor
 
     def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
@@ -148,19 +152,20 @@ class HiddenMatterLoss(Loss):
         assert rendering.weights is not None
         self.to(rendering.rgb.device)
         self.num_calls += 1
+        self.num_samples += rendering.weights.numel()
         # Nothing here waits for a device: which samples are seen, and how many, is known there only.
-        calls = torch.where(rendering.weights > SHARE_THAT_IS_SEEN, self.num_calls, torch.iinfo(torch.int64).min)
+        seen = torch.where(rendering.weights > SHARE_THAT_IS_SEEN, self.num_samples, torch.iinfo(torch.int64).min)
         cells = self._cells(rendering.output.extras["canonical_positions"].detach())
-        self.last_seen.view(-1).scatter_reduce_(0, cells.reshape(-1), calls.reshape(-1), "amax")
-        number = self.num_calls * self.num_points + torch.arange(self.num_points, device=calls.device)
+        self.last_seen.view(-1).scatter_reduce_(0, cells.reshape(-1), seen.reshape(-1), "amax")
+        number = self.num_calls * self.num_points + torch.arange(self.num_points, device=seen.device)
         unit = (number[:, None] * self.generators % 1).to(rendering.rgb.dtype)
         places = renderer.sampler.places(unit.clamp(max=1 - torch.finfo(unit.dtype).eps))
         if places is None:
             return rendering.rgb.new_zeros(())
-        with torch.no_grad(), renderer.autocast(calls.device):
+        with torch.no_grad(), renderer.autocast(seen.device):
             canonical = field.deformation(*places)
-        is_hidden = self.num_calls - self.last_seen.view(-1)[self._cells(canonical)] > self.memory
-        with renderer.autocast(calls.device):
+        is_hidden = self.num_samples - self.last_seen.view(-1)[self._cells(canonical)] > self.memory_samples
+        with renderer.autocast(seen.device):
             density = field.canonical.density(canonical, places[1])
         return self.weight * (is_hidden * -torch.expm1(-self.length * density)).mean()
 

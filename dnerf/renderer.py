@@ -293,12 +293,14 @@ class Renderer(nn.Module):
 
     def _empty(self, camera: Camera, time: float) -> Tensor:
         """A picture (P, 5) of nothing: the background, no opacity, no depth."""
+        size = camera.intrinsics.width * camera.intrinsics.height
         if isinstance(self.background, ConstantBackground):
-            size = camera.intrinsics.width * camera.intrinsics.height
-            color = self.background(camera.pose.new_zeros(1, 3)).expand(size, 3)
+            color = self.background(camera.pose.new_zeros(1, 3))
         else:
             color = self.background(camera.rays(time).directions)
-        return torch.nn.functional.pad(color, (0, 2))
+        picture = color.new_zeros(size, 5)
+        picture[:, :3] = color
+        return picture
 
     def _in_chunks(
         self, rays: Rays, field: RadianceField, chunk: int, tracer: FrameTracer | None

@@ -28,5 +28,5 @@ def small_renderer(*, graphs: bool = False, device: str = "cpu", **sampling: obj
 
 def losses() -> dict[str, Loss]:
     """Those of the fast path."""
-    terms = (PhotometricLoss(), ElasticLoss(), SteadyMatterLoss(), HiddenMatterLoss(BOX, memory=2))
+    terms = (PhotometricLoss(), ElasticLoss(), SteadyMatterLoss(), HiddenMatterLoss(BOX, memory_samples=200))
     return dict(zip(LOSSES, terms, strict=True))

@@ -7,6 +7,7 @@ from torch import Tensor
 from dnerf.benchmarks.closed_flows import Expansion, Rotation, Shear
 from dnerf.compositing import FieldOutput, Rendering
 from dnerf.deformations import Deformation, DisplacementDeformation, FlowDeformation, LatticeFlow
+from dnerf.deformations.folding import folding
 from dnerf.deformations.velocities import NetworkVelocity, Velocity
 from dnerf.fields import DeformedField, GridField, RadianceField
 from dnerf.motion_losses import (
@@ -202,6 +203,25 @@ def test_cycle_is_the_squared_miss_of_the_uncorrected_inverse() -> None:
     miss = (rate * extras["times"]) ** 2 * extras["positions"].norm(dim=-1)
     assert float(loss) == pytest.approx(float((shares * miss.square()).sum()), rel=1e-6)
     assert value(CycleConsistencyLoss(1.0), Expansion(rate), num_steps=64) < 1e-12
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_cycles_does_not_fold(seed: int) -> None:
+    """A field too sharp for one step folds space; minimising the loss alone leaves none that does, and some motion."""
+    torch.manual_seed(seed)
+    velocity = NetworkVelocity(((-1.0,) * 3, (1.0,) * 3), 2, 32)
+    torch.nn.init.normal_(velocity.mlp.output.weight, std=0.1)
+    renderer = renderer_of(velocity, canonical_time=None, clock="frozen", solver="midpoint", num_steps=1)
+    picture = rendering(500, torch.float32)
+    places = [picture.output.extras[name] for name in ("positions", "times")]
+    assert folding(renderer.field.deformation, *places).least_determinant < 0
+    optimizer = torch.optim.Adam(velocity.parameters(), 3e-3)
+    for _ in range(60):
+        optimizer.zero_grad()
+        CycleConsistencyLoss(1.0)(picture, torch.zeros(8, 3), renderer).backward()
+        optimizer.step()
+    assert folding(renderer.field.deformation, *places).least_determinant > 0.1
+    assert velocity(*places).norm(dim=-1).mean() > 0.1
 
 
 @every_loss
