@@ -31,8 +31,13 @@ def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tens
     """
     if not (_is_bfloat16_wanted(inputs) and choose(inputs) != "reference"):
         return relu_layers_reference(inputs, weights, biases)
-    parameters = [p.bfloat16() for p in (*weights, *biases)]
-    outputs = _Layers.apply(inputs.reshape(-1, inputs.shape[-1]).bfloat16(), *parameters)
+    weights, biases = [p.bfloat16() for p in weights], [p.bfloat16() for p in biases]
+    outputs = inputs.reshape(-1, inputs.shape[-1]).bfloat16()
+    if torch.is_grad_enabled():
+        outputs = _Layers.apply(outputs, *weights, *biases)
+    else:  # each output takes the memory of the one before the last, which is still near
+        for weight, bias in zip(weights, biases, strict=True):
+            outputs = _layer(outputs, weight, bias)
     return outputs.reshape(*inputs.shape[:-1], len(biases[-1]))
 
 
@@ -60,15 +65,18 @@ def _is_bfloat16_wanted(inputs: Tensor) -> bool:
     )
 
 
+def _layer(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    if inputs.is_cuda:
+        return torch.relu_(torch.addmm(bias, inputs, weight.mT))
+    return torch.ops.mkldnn._linear_pointwise(inputs, weight, bias, "leaky_relu", [SLOPE], "")
+
+
 class _Layers(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, *parameters: Tensor) -> Tensor:
         outputs, num_layers = [inputs], len(parameters) // 2
         for weight, bias in zip(parameters[:num_layers], parameters[num_layers:], strict=True):
-            if inputs.is_cuda:
-                outputs.append(torch.relu_(torch.addmm(bias, outputs[-1], weight.mT)))
-            else:
-                outputs.append(torch.ops.mkldnn._linear_pointwise(outputs[-1], weight, bias, "leaky_relu", [SLOPE], ""))
+            outputs.append(_layer(outputs[-1], weight, bias))
         ctx.save_for_backward(*outputs, *parameters[:num_layers])
         return outputs[-1]
 

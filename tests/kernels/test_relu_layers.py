@@ -54,6 +54,8 @@ def test_fused_agrees_forward_and_backward(shape: tuple[int, ...], widths: tuple
         outputs = under_autocast(backend, inputs, network)
         outputs.float().square().sum().backward()
         found.append([outputs, inputs.grad, *(p.grad for p in network.parameters())])
+    with torch.no_grad():
+        assert torch.equal(under_autocast("auto", quick, network), found[1][0])
     for expected, got in zip(*found, strict=True):
         assert got.shape == expected.shape
         assert got.dtype == expected.dtype
