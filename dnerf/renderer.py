@@ -161,11 +161,6 @@ class Renderer(nn.Module):
     def _ends_early(self) -> bool:
         return self.stop_transmittance > 0 and self.quadrature == "constant"
 
-    def _tracer(self, field: RadianceField, camera: Camera, time: float) -> FrameTracer | None:
-        if not self._ends_early:
-            return None
-        return FrameTracer.of(field, self.sampler.grid_at(time, camera.pose.dtype), time, self.stop_transmittance)
-
     def _marched(self, rays: Rays) -> Source | None:
         """Samples that are looked for only when light still gets there; None if the sampler places all at once."""
         begins = rays.near.clone()
@@ -259,8 +254,10 @@ class Renderer(nn.Module):
         """A picture (P, 5) whose rays end where they are opaque."""
         seen = self.sampler.seen_rays(camera, time)
         numbers, rays = (None, camera.rays(time)) if seen is None else seen
-        field = self.field.at_time(time)
-        parts = list(self._in_chunks(rays, field, chunk, self._tracer(field, camera, time)))
+        grid = self.sampler.grid_at(time, camera.pose.dtype)
+        field = self.field.at_time(time, None if grid is None else grid.extent())
+        tracer = FrameTracer.of(field, grid, time, self.stop_transmittance) if self._ends_early else None
+        parts = list(self._in_chunks(rays, field, chunk, tracer))
         columns = [_columns(part) for part in parts]
         if numbers is None:
             return torch.cat(columns)

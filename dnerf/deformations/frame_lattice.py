@@ -1,5 +1,6 @@
 """A deformation at one time, kept on a lattice: what a whole frame needs of it is computed once."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -33,9 +34,22 @@ class FrameLattice:
         sides = self.box[1] - self.box[0]
         self.cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
 
-    def at_time(self, deformation: Deformation, time: float) -> "FrozenDeformation":
-        """A stand-in for the deformation at one time, in [0, 1]."""
-        return FrozenDeformation(deformation, self, time)
+    def at_time(self, deformation: Deformation, time: float, extent: Tensor | None = None) -> "FrozenDeformation":
+        """A stand-in for the deformation at one time, in [0, 1]; if a box (2, 3) is given, for what lies in it."""
+        return FrozenDeformation(deformation, self, time, extent)
+
+    def faces(self, extent: Tensor | None = None) -> list[Tensor]:
+        """Where vertices are on each axis, at least two; only those of cells that reach into a box (2, 3), if given."""
+        faces = []
+        for axis, cells in enumerate(self.cells):
+            low, side = self.box[0, axis], self.box[1, axis] - self.box[0, axis]
+            first, end = 0, cells
+            if extent is not None:
+                places = ((extent[:, axis].cpu() - low) / side * cells).clamp(0, cells)
+                first = min(int(places[0]), cells - 1)
+                end = max(math.ceil(places[1]), first + 1)
+            faces.append(low + side * torch.arange(first, end + 1) / cells)
+        return faces
 
 
 class FrozenDeformation(Deformation):
@@ -48,20 +62,32 @@ class FrozenDeformation(Deformation):
         deformation: what is asked at vertices.
         lattice: where they are.
         time: in [0, 1]; the only one at which it may be called.
+        extent: (2, 3), the part of the lattice's box that is wanted, in world units; None for all. The smaller, the
+            nearer to the processor its tables stay. Outside, the deformation itself is asked.
         pad_to: the number of vertices asked is rounded up to a multiple of this, or to a power of two below it, since
             matrix libraries compile code for every new number of rows.
     """
 
-    def __init__(self, deformation: Deformation, lattice: FrameLattice, time: float, *, pad_to: int = 2048) -> None:
+    def __init__(
+        self,
+        deformation: Deformation,
+        lattice: FrameLattice,
+        time: float,
+        extent: Tensor | None = None,
+        *,
+        pad_to: int = 2048,
+    ) -> None:
         super().__init__()
         self.deformation = deformation
         self.time = time
         self.pad_to = pad_to
-        num_vertices = (lattice.cells[0] + 1) * (lattice.cells[1] + 1) * (lattice.cells[2] + 1)
-        self.levels = GridLevels([lattice.cells], 1 << (num_vertices - 1).bit_length())
-        self.low, self.sides = lattice.box[0], lattice.box[1] - lattice.box[0]
+        self.faces = lattice.faces(extent)
+        num_vertices = math.prod(len(x) for x in self.faces)
+        self.levels = GridLevels([[len(x) - 1 for x in self.faces]], 1 << (num_vertices - 1).bit_length())
+        self.low = torch.stack([x[0] for x in self.faces])
+        self.sides = torch.stack([x[-1] for x in self.faces]) - self.low
         self.displacements = torch.full((num_vertices, 4), torch.nan)  # four, so that rows are aligned
-        self.is_known = torch.zeros([c + 1 for c in reversed(lattice.cells)], dtype=torch.bool)
+        self.is_known = torch.zeros([len(x) for x in reversed(self.faces)], dtype=torch.bool)
 
     @torch.no_grad()
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
@@ -91,6 +117,7 @@ class FrozenDeformation(Deformation):
         """Have what is kept on a device."""
         if self.displacements.device != device:
             self.low, self.sides = self.low.to(device), self.sides.to(device)
+            self.faces = [x.to(device) for x in self.faces]
             self.displacements, self.is_known = self.displacements.to(device), self.is_known.to(device)
 
     def _fill(self, unit: Tensor) -> None:
@@ -140,12 +167,8 @@ class FrozenDeformation(Deformation):
         if not len(places):
             return False
         padded = torch.cat([places, places[-1:].expand(self._padded(len(places)) - len(places))])
-        columns = []
-        for axis, place in enumerate(reversed(torch.unravel_index(padded, self.is_known.shape))):
-            cells = self.levels.cells[axis]
-            faces = self.low[axis] + self.sides[axis] * torch.arange(cells + 1, device=padded.device) / cells
-            columns.append(faces[place])
-        vertices = torch.stack(columns, dim=-1)
+        numbers = reversed(torch.unravel_index(padded, self.is_known.shape))
+        vertices = torch.stack([faces[number] for faces, number in zip(self.faces, numbers, strict=True)], dim=-1)
         displaced = self.deformation(vertices, vertices.new_full((len(vertices),), self.time)) - vertices
         self.displacements[places] = torch.nn.functional.pad(displaced[: len(places)].float(), (0, 1))
         self.is_known.view(-1)[places] = True

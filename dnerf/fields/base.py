@@ -74,10 +74,11 @@ class RadianceField(nn.Module, ABC):
         """The field to ask once nothing is learnt any more; itself, unless something can be kept between frames."""
         return self
 
-    def at_time(self, time: float) -> "RadianceField":
+    def at_time(self, time: float, extent: Tensor | None = None) -> "RadianceField":
         """The field to ask while a frame of one time is rendered; itself, unless something can be kept for it.
 
         Args:
             time: in [0, 1]; what is returned may be asked at no other.
+            extent: (2, 3) box in world units beyond which it will hardly be asked, if that is known.
         """
         return self

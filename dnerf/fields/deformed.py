@@ -71,11 +71,11 @@ class DeformedField(RadianceField):
         baked = self.baking.bake(self.canonical)
         return self._like(DeformedField(self.deformation, baked, frame_lattice=self.frame_lattice))
 
-    def at_time(self, time: float) -> RadianceField:
+    def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
         """The same with the deformation kept on the lattice, if there is one and anything moves."""
         if self.frame_lattice is None or isinstance(self.deformation, IdentityDeformation):
             return self
-        frozen = self.frame_lattice.at_time(self.deformation, time)
+        frozen = self.frame_lattice.at_time(self.deformation, time, extent)
         return self._like(DeformedField(frozen, self.canonical))
 
     def _like(self, field: "DeformedField") -> "DeformedField":

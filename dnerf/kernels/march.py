@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .backend import choose, run_compiled
-from .skip_distances import blocks_shape
+from .skip_distances import BLOCK_BITS, blocks_shape
 
 
 class MarchedSamples(NamedTuple):
@@ -43,6 +43,17 @@ class MarchGrid(NamedTuple):
     step: float
     splits: int = 1
     split_weight: float = 0.0
+
+    def extent(self) -> Tensor:
+        """A box (2, 3) that holds all kept intervals: blocks of cells, and half an interval around them."""
+        bounds = []
+        for axis in range(3):
+            blocks = (self.skips == 0).movedim(axis, 0).flatten(1).any(1).nonzero()[:, 0].tolist()
+            bounds.append((blocks[0], blocks[-1] + 1) if blocks else (0, 0))
+        cells = torch.tensor(bounds, device=self.aabb.device).T << BLOCK_BITS
+        size = torch.tensor(self.occupancy.shape, device=self.aabb.device)
+        corners = torch.lerp(*self.aabb, torch.minimum(cells, size) / size)
+        return corners + self.step * corners.new_tensor([[-0.5], [0.5]])
 
 
 @torch.no_grad()

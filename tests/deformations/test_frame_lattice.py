@@ -95,6 +95,32 @@ def test_outside_its_box_the_deformation_itself_is_asked() -> None:
     assert torch.equal(frozen[outside], Bend()(x, times)[outside])
 
 
+def test_part_of_a_lattice_holds_what_the_whole_one_does() -> None:
+    x = points(3000, 1, torch.float32)
+    times = torch.full((3000,), 0.7)
+    lattice, extent = FrameLattice(BOX, 24), torch.tensor([[-0.31, -2.0, 0.1], [0.42, 0.55, 0.2]])
+    whole, part = lattice.at_time(Bend(), 0.7), lattice.at_time(Bend(), 0.7, extent)
+    assert part.is_known.numel() < 0.2 * whole.is_known.numel()
+    inside = ((x >= extent[0]) & (x <= extent[1])).all(-1)
+    expected, found = whole(x, times), part(x, times)
+    torch.testing.assert_close(found[inside], expected[inside], rtol=0, atol=1e-6)  # fractions round otherwise
+    assert inside.sum() > 50
+    beyond = ((x < part.low) | (x > part.low + part.sides)).any(-1)
+    assert torch.equal(found[beyond], Bend()(x, times)[beyond])
+    assert (beyond & ~inside).sum() > 1000
+    assert not (beyond & inside).any()
+
+
+@pytest.mark.parametrize("corners", [(2.0, 3.0), (-3.0, -2.0), (0.1, 0.1), (0.3, 0.2)])
+def test_part_of_a_lattice_where_there_is_none_is_still_one(corners: tuple[float, float]) -> None:
+    extent = torch.tensor(corners)[:, None].expand(2, 3)
+    part = FrameLattice(BOX, 24).at_time(Bend(), 0.7, extent)
+    assert 8 <= part.is_known.numel() <= 27
+    x = points(40, 2, torch.float32)
+    times = torch.full((40,), 0.7)
+    torch.testing.assert_close(part(x, times), Bend()(x, times), rtol=0, atol=1e-3)
+
+
 def test_shapes_emptiness_and_other_times() -> None:
     frozen = FrameLattice(BOX, 4).at_time(Bend(), 0.25)
     assert frozen(torch.zeros(2, 3, 3), torch.full((2, 3), 0.25)).shape == (2, 3, 3)

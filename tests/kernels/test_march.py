@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dnerf import kernels
-from dnerf.kernels import march, skip_distances
+from dnerf.kernels import MarchGrid, march, skip_distances
 
 BOX = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 0.5, 3.0]])
 
@@ -222,6 +222,26 @@ def test_rays_that_are_not_finite_get_no_samples(compiled):
 def test_wrong_arguments_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         march(**rays(4) | {"occupancy": grid(), "aabb": BOX, "step": 0.1} | change)
+
+
+@pytest.mark.parametrize("share", [0.0005, 0.002, 0.5])
+def test_all_intervals_lie_in_the_grids_extent(share):
+    occupancy = grid((1, 40, 9, 24), share, seed=2)
+    found = MarchGrid(occupancy[0], skip_distances(occupancy)[0], BOX, 0.05).extent()
+    bundle = rays(3000, seed=4)
+    kept = march(**bundle, occupancy=occupancy, aabb=BOX, step=0.05)
+    o, d = (bundle[name][kept.ray_indices] for name in ("origins", "directions"))
+    assert len(o)
+    for distances in (kept.starts, kept.ends):
+        places = o + distances[:, None] * d
+        assert ((places >= found[0] - 1e-5) & (places <= found[1] + 1e-5)).all()
+    assert share > 0.0005 or ((found[1] - found[0]) < 0.9 * (BOX[1] - BOX[0])).any()
+
+
+def test_extent_of_nothing_is_small():
+    empty = grid(share=0.0)
+    found = MarchGrid(empty[0], skip_distances(empty)[0], BOX, 0.05).extent()
+    torch.testing.assert_close(found[1] - found[0], torch.full((3,), 0.05))
 
 
 def test_opcheck():
