@@ -52,7 +52,7 @@ class MarchGrid(NamedTuple):
             bounds.append((blocks[0], blocks[-1] + 1) if blocks else (0, 0))
         cells = torch.tensor(bounds, device=self.aabb.device).T << BLOCK_BITS
         size = torch.tensor(self.occupancy.shape, device=self.aabb.device)
-        corners = torch.lerp(*self.aabb, torch.minimum(cells, size) / size)
+        corners = torch.lerp(self.aabb[0], self.aabb[1], torch.minimum(cells, size) / size)
         return corners + self.step * corners.new_tensor([[-0.5], [0.5]])
 
 
