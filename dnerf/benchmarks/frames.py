@@ -1,6 +1,7 @@
 """What a frame of a finished model takes, alone and in a sequence, and how near it comes to the truth."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from dnerf.data.frames import Frames
 from dnerf.evaluation import spread_indices
 from dnerf.metrics import psnr
 from dnerf.renderer import FRAMES_THAT_SHARE, Renderer
-from dnerf.samplers import OccupancySampler
+from dnerf.samplers import OccupancySampler, Sampler
 
 ALONE, SHARED = "one frame", "in a sequence"
 
@@ -108,11 +109,25 @@ def _ways(renderer: Renderer, splits: list[int]) -> Iterator[tuple[tuple[str, in
 def _pictures(
     renderer: Renderer, splits: int | None, frames: Frames, chosen: list[int], shown: Intrinsics, chunk: int
 ) -> list[Tensor]:
-    if isinstance(renderer.sampler, OccupancySampler) and splits is not None:
-        renderer.sampler.render_splits = splits  # of all ways: they share a sampler
     cameras = [replace(frames.camera(i), intrinsics=shown) for i in chosen]
     times = [float(frames.times[i]) for i in chosen]
-    return [renderer.render_image(camera, time, chunk=chunk).rgb for camera, time in zip(cameras, times, strict=True)]
+    with _cutting(renderer.sampler, splits):
+        return [
+            renderer.render_image(camera, time, chunk=chunk).rgb for camera, time in zip(cameras, times, strict=True)
+        ]
+
+
+@contextmanager
+def _cutting(sampler: Sampler, splits: int | None) -> Iterator[None]:
+    """Meanwhile cut the steps in which something is seen into so many: the ways to show a frame share a sampler."""
+    if splits is None or not isinstance(sampler, OccupancySampler):
+        yield
+        return
+    own, sampler.render_splits = sampler.render_splits, splits
+    try:
+        yield
+    finally:
+        sampler.render_splits = own
 
 
 def _plot(rows: list[dict[str, Any]]) -> Plot:

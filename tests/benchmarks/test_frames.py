@@ -68,3 +68,14 @@ def test_other_samplers_have_one_way_and_settings_must_read_runs() -> None:
 def test_pictures_of_another_size_are_timed_and_not_compared() -> None:
     found = rows(Renderer(SCENES["static"](), StratifiedSampler(16)), scales=[1, 1.5])
     assert [(row["size"], row["psnr"] is None) for row in found] == [("16 x 16", False), ("24 x 24", True)]
+
+
+def test_every_size_is_shown_in_the_runs_own_steps_first() -> None:
+    scene = SCENES["static"]()
+    sampler = OccupancySampler(BOX, 0.3, 16, splits=2, min_weight=0)
+    sampler.occupy(torch.tensor(True))
+    found = rows(Renderer(scene, sampler, stop_transmittance=1e-4), scales=[1, 1.5], splits=[1])
+    assert [(row["size"], row["splits"]) for row in found] == [
+        ("16 x 16", 2), ("16 x 16", 1), ("24 x 24", 2), ("24 x 24", 1)
+    ]  # fmt: skip
+    assert sampler.render_splits == 2
