@@ -1,6 +1,6 @@
 """Checks of arguments at public doors: one line that names the argument, what was expected and what came."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -41,6 +41,16 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
     if not (value > 0 or (allow_zero and value == 0)) or value == float("inf"):
         bound = ">= 0" if allow_zero else "> 0"
         raise ValueError(f"{name} must be {bound} and finite, got {value}")
+
+
+def check_mapping(name: str, value: object) -> None:
+    """Raise unless `value` holds values by name.
+
+    Raises:
+        ValueError: naming the argument and its value.
+    """
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} must hold values by name, got {value!r}")
 
 
 def check_choice(name: str, value: object, choices: Sequence[object]) -> None:

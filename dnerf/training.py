@@ -11,7 +11,7 @@ from torch import nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
-from dnerf.checks import check_choice, check_positive
+from dnerf.checks import check_choice, check_mapping, check_positive
 from dnerf.data.frames import Frames
 from dnerf.distributed import Processes
 from dnerf.graphs import GraphCache
@@ -93,6 +93,8 @@ class Trainer:
         progress_bar: bool = True,
         recovery: Recovery | None = None,
     ) -> None:
+        check_mapping("learning_rates", learning_rates or {})
+        check_mapping("loss_every", loss_every or {})
         for name, value in (
             ("num_steps", num_steps),
             ("num_rays", num_rays),
@@ -120,6 +122,8 @@ class Trainer:
         self.learning_rates = {"": 5e-4} if learning_rates is None else dict(learning_rates)
         if "" not in self.learning_rates:
             raise ValueError(f"learning_rates must have a default under '', got {self.learning_rates}")
+        for prefix, rate in self.learning_rates.items():
+            check_positive(f"learning_rates.{prefix}", rate, allow_zero=True)
         self.schedule = schedule
         self.final_learning_rate = final_learning_rate
         self.warmup_steps = warmup_steps

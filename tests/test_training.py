@@ -176,3 +176,17 @@ def test_a_step_without_any_loss_changes_nothing(frames):
 def test_turns_must_be_whole_and_positive(every, expected):
     with pytest.raises(ValueError, match=rf"loss_every\.haze must be {expected}"):
         trainer(loss_every={"haze": every})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("learning_rates", "fast", "learning_rates must hold values by name, got 'fast'"),
+        ("learning_rates", {"": 1e-3, "field": "fast"}, "learning_rates.field must be a number, got 'fast'"),
+        ("learning_rates", {"": -1e-3}, r"learning_rates\. must be >= 0 and finite, got -0.001"),
+        ("loss_every", "often", "loss_every must hold values by name, got 'often'"),
+    ],
+)
+def test_values_by_name_are_named_when_they_are_wrong(name, value, expected):
+    with pytest.raises(ValueError, match=expected):
+        trainer(**{name: value})
