@@ -249,6 +249,12 @@ class CheckpointFolder:
             raise ValueError(f"{self.folder}: no checkpoint can be read; {problems[0]}")
         return None
 
+    def clear(self) -> None:
+        """Remove all checkpoints."""
+        for path in self._files():
+            path.unlink(missing_ok=True)
+        self._good = None
+
     def _files(self) -> list[Path]:
         return [path for path in self.folder.glob("step_*.safetensors") if NAME.fullmatch(path.name)]
 

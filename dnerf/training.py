@@ -11,6 +11,7 @@ from torch import nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
+from dnerf.box_check import BoxCheck
 from dnerf.checks import check_choice, check_mapping, check_positive
 from dnerf.data.frames import Frames
 from dnerf.distributed import Processes
@@ -63,6 +64,7 @@ class Trainer:
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
         recovery: brings a run back that goes to NaN or collapses; None lets it end with an error.
+        box_check: ends training by `BoxTooLarge` early on, if matter fills a small part of the box; None never does.
 
     Raises:
         ValueError: for numbers out of range, or learning rates without a default.
@@ -92,6 +94,7 @@ class Trainer:
         checkpoint_every: int | None = 1000,
         progress_bar: bool = True,
         recovery: Recovery | None = None,
+        box_check: BoxCheck | None = None,
     ) -> None:
         check_mapping("learning_rates", learning_rates or {})
         check_mapping("loss_every", loss_every or {})
@@ -139,6 +142,7 @@ class Trainer:
         self.checkpoint_every = checkpoint_every
         self.progress_bar = progress_bar
         self.recovery = recovery
+        self.box_check = box_check
 
     def fit(
         self,
@@ -150,6 +154,7 @@ class Trainer:
         checkpoints: CheckpointFolder | None = None,
         resume: bool = False,
         processes: Processes | None = None,
+        seconds: float = 0.0,
     ) -> TrainingRecord:
         """Train in place.
 
@@ -163,6 +168,7 @@ class Trainer:
             checkpoints: where states are written every `checkpoint_every` steps and at the end, or None.
             resume: continue from the newest checkpoint, if there is one, exactly as if training had never stopped.
             processes: those that train together; None for this one alone.
+            seconds: of `max_seconds` that were spent before; a checkpoint knows its own.
 
         Returns:
             The last step's record.
@@ -171,6 +177,7 @@ class Trainer:
             FloatingPointError: naming step and tensors, when the loss is not finite.
             ValueError: if frames have no alpha but a random background needs it, or a checkpoint does not fit.
             TrainingStopped: after a signal.
+            BoxTooLarge: if `box_check` finds so; the model is of no more use, and neither are its checkpoints.
             MemoryError: saying what to lower, when a GPU's memory does not suffice.
             OSError: if the last checkpoint cannot be written; for earlier ones a warning is logged.
         """
@@ -181,6 +188,7 @@ class Trainer:
         generator = torch.Generator(renderer.device).manual_seed(seed)
         modules = {"renderer": renderer, "losses": self.losses}
         run = RunState(modules, self.optimizer(renderer), generator, max(self.num_rays, processes.size))
+        run.seconds = seconds
         if checkpoints is not None:
             run.data = fingerprint(frames)
         renderer.train()
@@ -310,6 +318,8 @@ class Trainer:
         run.optimizer.set_rates(factor * (1.0 if self.recovery is None else self.recovery.factor))
         processes.merge_observations(renderer, run.step)
         steps.update(run.step)
+        if self.box_check is not None:
+            self.box_check(run.step, run.seconds, renderer, frames)
         generator, num_rays = run.generator, run.num_rays
         if self.time_window is None:
             indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)

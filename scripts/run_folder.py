@@ -1,6 +1,6 @@
 """The folder of a run: a new one, or the one whose training is continued."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -56,14 +56,44 @@ def continued(config: DictConfig) -> DictConfig:
     given = {override.get_key_element().lstrip("+~").partition("@")[0] for override in overrides}
     values = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     assert isinstance(values, DictConfig)
+    fit = saved.get("box_fit")
+    if fit is not None and values.data.box == fit.given:  # the run has found that less is enough
+        values = in_box(values, saved.data.box, fit.seconds)
     if given & set(hydra.runtime.choices):  # an experiment or another group was named: all of it must agree
         _check_same(_leaves(saved), _leaves(values), folder)
-        return config
+        return values
     before, now = ({key: OmegaConf.select(node, key) for key in given} for node in (saved, values))
     _check_same(before, now, folder)
     for key in given & set(CHANGEABLE):
         OmegaConf.update(saved, key, OmegaConf.select(values, key), force_add=True)
     return saved
+
+
+def in_box(config: DictConfig, box: Sequence[Sequence[float]], seconds: float) -> DictConfig:
+    """A run's config with another `data.box`, also wherever else a `box` is that one.
+
+    Args:
+        config: of the run.
+        box: (2, 3) corners, in world units.
+        seconds: of training that were spent to find it.
+
+    Returns:
+        A config without interpolations, whose `box_fit` says what box was given and the seconds.
+    """
+    values = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(values, dict)
+    before = values["data"]["box"]
+    corners = [[float(value) for value in corner] for corner in box]
+    given = (values.get("box_fit") or {"given": before})["given"]
+    changed = OmegaConf.create({**_with_box(values, before, corners), "box_fit": {"given": given, "seconds": seconds}})
+    assert isinstance(changed, DictConfig)
+    return changed
+
+
+def _with_box(node: Any, before: object, after: object) -> Any:
+    if isinstance(node, dict):
+        return {k: after if k == "box" and v == before else _with_box(v, before, after) for k, v in node.items()}
+    return [_with_box(value, before, after) for value in node] if isinstance(node, list) else node
 
 
 def _check_same(before: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
@@ -119,13 +149,18 @@ def opened(config: DictConfig) -> Iterator[Path]:
     with claimed(folder):
         for path in (folder, *(folder / name for name in OWN_FOLDERS)):
             remove_leftovers(path)
-        saved = config.copy()
-        with open_dict(saved):
-            saved.out_dir, saved.resume = str(folder), False
-        write_text(folder / "config.yaml", OmegaConf.to_yaml(saved, resolve=True))
+        save_config(folder, config)
         if not (folder / "overrides.json").exists():
             write_json(folder / "overrides.json", list(HydraConfig.get().overrides.task))
         yield folder
+
+
+def save_config(folder: Path, config: DictConfig) -> None:
+    """Write the config, resolved, into the run's folder."""
+    saved = config.copy()
+    with open_dict(saved):
+        saved.out_dir, saved.resume = str(folder), False
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(saved, resolve=True))
 
 
 def _is_free(folder: Path) -> bool:

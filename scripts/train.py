@@ -10,14 +10,19 @@ import torch
 from hydra_app import build, resolve_device, run_app
 from omegaconf import DictConfig, OmegaConf
 from reporting import evaluate_run, print_scores
-from run_folder import continued, opened
+from run_folder import continued, in_box, opened, save_config
 
+from dnerf.box_check import BoxTooLarge
 from dnerf.checkpoints import save_weights
+from dnerf.data.frames import Frames
+from dnerf.data.source import DataSource
 from dnerf.distributed import Processes, started
 from dnerf.files import write_json
 from dnerf.logs import JsonLinesLog, Previews, TensorBoardLog, tensorboard_writer
 from dnerf.provenance import commit, hardware
+from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder
+from dnerf.training import Trainer, TrainingRecord
 
 
 def main(config: DictConfig) -> None:
@@ -35,27 +40,24 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     """Build data, model and trainer; train; save weights, logs and scores in the run's folder."""
     torch.manual_seed(config.seed)
     data = build(config.data)
-    renderer = build(config.renderer).to(device)
-    trainer = build(config.trainer)
+    model = build(config.renderer).to(device), build(config.trainer)
     frames = data.frames("train")  # after what can be refused in no time: exact frames are rendered first
-    num_parameters = sum(p.numel() for p in renderer.parameters())
     name = processes.from_first(lambda: str(held.enter_context(opened(config))).encode())
     assert name is not None
     folder = Path(name.decode())
-    callbacks: list[Callable[..., None]] = []
-    if processes.is_first:
-        size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
-        print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {device}")
-        callbacks = _callbacks(config, folder, data, held)
-    record = trainer.fit(
-        renderer,
-        frames,
-        seed=config.seed,
-        callbacks=callbacks,
-        checkpoints=CheckpointFolder(folder / "checkpoints"),
-        resume=resume,
-        processes=processes,
-    )
+    found = _fit(config, model, folder, data, frames, resume, processes, held)
+    while isinstance(found, BoxTooLarge):
+        box = [[round(value, 4) for value in corner] for corner in found.box]
+        config = in_box(config, box, found.seconds)
+        if processes.is_first:
+            print(f"{folder}: after {found.seconds:.0f} s: the box can be {box}; beginning anew in there")
+            CheckpointFolder(folder / "checkpoints").clear()
+            save_config(folder, config)
+        torch.manual_seed(config.seed)
+        model = build(config.renderer).to(device), build(config.trainer)
+        found = _fit(config, model, folder, data, frames, resume, processes, held)
+    record, (renderer, _) = found, model
+    num_parameters = sum(p.numel() for p in renderer.parameters())
     if not processes.is_first:
         return
     save_weights(renderer, folder / "model.safetensors")
@@ -78,6 +80,39 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
             ),
             folder,
         )
+
+
+def _fit(
+    config: DictConfig,
+    model: tuple[Renderer, Trainer],
+    folder: Path,
+    data: DataSource,
+    frames: Frames,
+    resume: bool,
+    processes: Processes,
+    held: ExitStack,
+) -> TrainingRecord | BoxTooLarge:
+    """Train the model until the end, or until its box turns out to be far too large."""
+    renderer, trainer = model
+    callbacks: list[Callable[..., None]] = []
+    if processes.is_first:
+        size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
+        num_parameters = sum(p.numel() for p in renderer.parameters())
+        print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {renderer.device}")
+        callbacks = _callbacks(config, folder, data, held)
+    try:
+        return trainer.fit(
+            renderer,
+            frames,
+            seed=config.seed,
+            callbacks=callbacks,
+            checkpoints=CheckpointFolder(folder / "checkpoints"),
+            resume=resume,
+            processes=processes,
+            seconds=0.0 if config.box_fit is None else config.box_fit.seconds,
+        )
+    except BoxTooLarge as found:
+        return found.with_traceback(None)
 
 
 def _is_scored(folder: Path, config: DictConfig, training: dict[str, Any]) -> bool:

@@ -47,6 +47,7 @@ FLOORS = {
     "time_window": 6,
     "visualisation": 6,
     # 7: whole runs.
+    "box_check": 7,
     "checkpoints": 7,
     "consistency": 7,
     "distributed": 7,
@@ -85,6 +86,7 @@ WITHIN_A_FLOOR = {
     ("sequences", "video"),
     ("temporal_evaluation", "evaluation"),
     ("run_state", "checkpoints"),
+    ("training", "box_check"),
     ("training", "distributed"),
     ("training", "run_state"),
     ("training", "steps"),

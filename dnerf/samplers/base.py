@@ -132,6 +132,11 @@ class Sampler(nn.Module, ABC):
         """Share of space, averaged over time, in which pictures have samples; 1 unless known to be less."""
         return 1.0
 
+    def cells_at_any_time(self) -> tuple[Tensor, Tensor] | None:
+        """Corners (2, 3) of what this sampler keeps account of, and which of the cells (Gx, Gy, Gz) that it is cut into
+        pictures look into at some time; None if it keeps none."""
+        return None
+
     def places(self, unit: Tensor) -> tuple[Tensor, Tensor] | None:
         """Places where matter may be, evenly spread over all of them; None if this sampler does not know.
 

@@ -88,6 +88,10 @@ class OccupancyGrid(Sampler):
         """Share of the cells that pictures look into."""
         return float((self.occupied if self.rendered is None else self.rendered).float().mean())
 
+    def cells_at_any_time(self) -> tuple[Tensor, Tensor]:
+        """See `Sampler.cells_at_any_time`."""
+        return self.box, self.looked_into(is_narrow=True)[0].any(0)
+
     def looked_into(self, is_narrow: bool) -> tuple[Tensor, Tensor]:
         """Occupied cells, those of pictures or those of training, and their skips."""
         if is_narrow and self.rendered is not None and self.rendered_skips is not None:

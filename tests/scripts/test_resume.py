@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 from launcher import Run, run_script
 
 SETTINGS = (
@@ -78,6 +79,50 @@ def test_a_signal_saves_and_the_run_continues_bit_for_bit(
         assert done.returncode == 0, done.stderr
         assert f"continuing after step {step}" in done.stdout
         assert [line["step"] for line in log_lines(run)] == list(range(1, step + 3))
+
+
+LARGE = "data.box=[[-4,-4,-4],[4,4,4]]"
+
+
+def test_a_run_in_a_box_that_is_too_large_goes_on_in_less_and_can_be_continued(tmp_path: Path) -> None:
+    done = train(tmp_path, LARGE, "trainer.num_steps=4")
+    assert done.returncode == 0, done.stderr
+    assert "beginning anew" in done.stdout
+    run = tmp_path / "run"
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    box = config["data"]["box"]
+    assert max(high - low for low, high in zip(*box)) < 7.2
+    assert config["box_fit"] == {"given": [[-4, -4, -4], [4, 4, 4]], "seconds": 0.0}
+    places = [config["sampler"], config["field"], config["renderer"]["sampler"], config["renderer"]["field"]["baking"]]
+    assert all(place["box"] == box for place in [*places, config["trainer"]["losses"]["hidden_matter"]])
+    assert [line["step"] for line in log_lines(run)] == [1, 2, 3, 4]
+    for named in ((), (LARGE,), (*SETTINGS, LARGE)):  # as it was given, the box is no other one
+        steps = f"trainer.num_steps={log_lines(run)[-1]['step'] + 2}"
+        more = run_script("train", "out_dir=run", "resume=true", *named, steps, cwd=tmp_path)
+        assert more.returncode == 0, more.stderr
+        assert "beginning anew" not in more.stdout
+        assert yaml.safe_load((run / "config.yaml").read_text())["data"]["box"] == box
+    assert [line["step"] for line in log_lines(run)] == list(range(1, 11))
+    other = train(tmp_path, "data.box=[[-5,-5,-5],[5,5,5]]", "resume=true", "trainer.num_steps=12")
+    assert other.returncode == 2
+    assert "box" in other.stderr
+
+
+def test_checkpoints_of_the_box_that_was_too_large_are_gone(tmp_path: Path) -> None:
+    """What has been trained until matter is found does not fit the smaller model."""
+    changes = (
+        "trainer.num_steps=12", "trainer.checkpoint_every=2", "trainer.box_check.every=4", "sampler.resolution=48",
+        "trainer.box_check.room=0", "trainer.box_check.shrink_below=0.99", "data.box=[[-3.4,-3.4,-3.4],[3.4,3.4,3.4]]",
+    )  # fmt: skip
+    # Views reach through 0.92 of the box: more than what is taken at once, less than what is taken later on.
+    done = train(tmp_path, *changes)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("beginning anew") == 1
+    assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["box_fit"]["seconds"] > 0
+    assert [line["step"] for line in log_lines(tmp_path / "run")] == list(range(1, 13))
+    again = train(tmp_path, *changes, "resume=true")
+    assert again.returncode == 0, again.stderr
+    assert "nothing to do" in again.stdout
 
 
 def test_a_stopped_run_ends_with_the_weights_of_an_uninterrupted_one(tmp_path: Path, whole: Path) -> None:

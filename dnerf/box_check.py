@@ -1,0 +1,133 @@
+"""Boxes that are far too large for what is in them: noticed early in training, so that it can begin anew in less."""
+
+import torch
+from torch import Tensor
+
+from dnerf.checks import check_positive
+from dnerf.data.frames import Frames
+from dnerf.renderer import Renderer
+
+SHRINK_AT_ONCE = 0.9
+
+
+class BoxTooLarge(Exception):
+    """What training found lies in a small part of the box; a model with `box` shows it in finer cells.
+
+    Args:
+        step: after which it was seen.
+        seconds: of training until then.
+        box: (2, 3) corners that are enough, in world units.
+    """
+
+    def __init__(self, step: int, seconds: float, box: list[list[float]]) -> None:
+        super().__init__(f"step {step}: matter fills a small part of the box, {box} is enough")
+        self.step = step
+        self.seconds = seconds
+        self.box = box
+
+
+class BoxCheck:
+    """Looks early in training how much of the box matter needs.
+
+    Grids, lattices and occupancy share out a fixed number of cells, so a box four times as long means cells four times
+    as long and a blurred picture. Before the first step it is known what the cameras see, after a few hundred steps
+    what is occupied. If that is much smaller than the box, all that is lost by beginning anew in a smaller one is those
+    steps. Nothing that is seen and occupied at any time lies outside the smaller one.
+
+    Args:
+        every: steps between checks.
+        until: last step at which one is made: haze of a large box takes its time to go.
+        shrink_below: longest side of what is needed, as a share of the box's, in (0, 1), below which the box is too
+            large; before the first step, when nothing is lost, `SHRINK_AT_ONCE`.
+        min_views: share of the training views, in [0, 1), that see a place which counts: where fewer look, a field may
+            hold anything. See `share_of_views`.
+        room: left at each face, as a share of the longest side: ends of what moves may not have been found yet.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(
+        self,
+        every: int = 32,
+        until: int = 512,
+        *,
+        shrink_below: float = 0.5,
+        min_views: float = 0.05,
+        room: float = 0.1,
+    ) -> None:
+        for name, value in (("every", every), ("until", until)):
+            check_positive(name, value)
+        if not 0 < shrink_below < 1:
+            raise ValueError(f"shrink_below must be in (0, 1), got {shrink_below}")
+        if not 0 <= min_views < 1:
+            raise ValueError(f"min_views must be in [0, 1), got {min_views}")
+        check_positive("room", room, allow_zero=True)
+        self.every = every
+        self.until = until
+        self.shrink_below = shrink_below
+        self.min_views = min_views
+        self.room = room
+
+    def __call__(self, step: int, seconds: float, renderer: Renderer, frames: Frames) -> None:
+        """Check, if it is time.
+
+        Args:
+            step: steps done; the sampler has learnt from the field since the last one.
+            seconds: of training so far.
+            renderer: in training.
+            frames: of the training.
+
+        Raises:
+            BoxTooLarge: with the box that is enough.
+        """
+        if step % self.every or step > self.until:
+            return
+        shrink_below, room = (SHRINK_AT_ONCE, 0.0) if step == 0 else (self.shrink_below, self.room)
+        box = self.smaller(renderer, frames, shrink_below, room)
+        if box is not None:
+            raise BoxTooLarge(step, seconds, box.tolist())
+
+    def smaller(self, renderer: Renderer, frames: Frames, shrink_below: float, room: float) -> Tensor | None:
+        """Corners (2, 3) of the box that is enough, or None if it is not much smaller.
+
+        Args:
+            renderer: whose sampler is asked where matter is; one that does not know needs all of its box.
+            frames: of the training.
+            shrink_below: see `BoxCheck`.
+            room: likewise.
+        """
+        known = renderer.sampler.cells_at_any_time()
+        if known is None:
+            return None
+        box, mask = (values.cpu() for values in known)
+        cells, size = mask.nonzero(), torch.tensor(mask.shape)
+        centers = torch.lerp(box[0], box[1], (cells + 0.5) / size)
+        cells = cells[share_of_views(frames, centers.to(frames.poses.device)).cpu() >= self.min_views]
+        if not len(cells):
+            return None
+        corners = torch.lerp(box[0], box[1], torch.stack([cells.amin(0), cells.amax(0) + 1]) / size)
+        side = (corners[1] - corners[0]).max()
+        if side >= shrink_below * (box[1] - box[0]).max():
+            return None
+        widened = corners + room * side * corners.new_tensor([[-1.0], [1.0]])
+        return torch.minimum(torch.maximum(widened, box[0]), box[1])
+
+
+def share_of_views(frames: Frames, positions: Tensor, most: int = 64) -> Tensor:
+    """The share (N,) of views between whose planes, and within whose picture, positions (N, 3) lie.
+
+    Args:
+        frames: with the views.
+        positions: in world units.
+        most: views that are asked, evenly spread over all.
+    """
+    count = min(most, len(frames))
+    width, height = frames.intrinsics.width, frames.intrinsics.height
+    seen = torch.zeros(len(positions), device=positions.device)
+    for index in torch.linspace(0, len(frames) - 1, count).round().long().tolist():
+        pixels, depth = frames.camera(index).project(positions)
+        x, y = pixels.unbind(-1)
+        is_between = (frames.near <= depth) & (depth <= frames.far)
+        seen += is_between & (x > -1) & (x < width) & (y > -1) & (y < height)
+    return seen / count

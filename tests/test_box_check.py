@@ -1,0 +1,174 @@
+"""Boxes that are far too large are noticed, and nothing that is seen and occupied is left out of the smaller one."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dnerf.backgrounds import ConstantBackground
+from dnerf.box_check import BoxCheck, BoxTooLarge, share_of_views
+from dnerf.cameras import Camera, Intrinsics, look_at, orbit_path
+from dnerf.compositing import FieldOutput
+from dnerf.data.frames import Frames
+from dnerf.fields import RadianceField
+from dnerf.losses import PhotometricLoss
+from dnerf.renderer import Renderer
+from dnerf.samplers import OccupancySampler, StratifiedSampler
+from dnerf.training import Trainer
+
+
+class Balls(RadianceField):
+    """A ball of radius 0.3 and density 50 that moves along x over [-0.6, 0.6], and one at rest at `stray`."""
+
+    def __init__(self, stray: tuple[float, float, float] | None = None) -> None:
+        super().__init__()
+        self.stray = stray
+        self.weight = torch.nn.Parameter(torch.ones(()))
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        center = torch.stack([1.2 * times - 0.6, 0 * times, 0 * times], -1)
+        inside = (positions - center).norm(dim=-1) < 0.3
+        if self.stray is not None:
+            inside = inside | ((positions - positions.new_tensor(self.stray)).norm(dim=-1) < 0.3)
+        return 50.0 * inside * self.weight
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        return FieldOutput(self.density(positions, times), torch.ones_like(positions) * 0.5)
+
+
+def views(count: int = 12) -> Frames:
+    """Views from a circle of radius 4 and height 2."""
+    lens = Intrinsics.from_angle(8, 8, math.radians(40))
+    poses = orbit_path(count, radius=math.sqrt(20), elevation=math.atan(0.5))
+    return Frames(torch.zeros(count, 8, 8, 3, dtype=torch.uint8), poses, torch.linspace(0, 1, count), lens)
+
+
+def renderer(half: float, field: RadianceField | None = None) -> Renderer:
+    box = [[-half] * 3, [half] * 3]
+    made = Renderer(
+        field or Balls(), OccupancySampler(box, 0.05, 32, num_slabs=4, num_probes=4096), ConstantBackground("white")
+    )
+    made.sampler.fill(made.field)
+    return made
+
+
+def test_the_smaller_box_holds_matter_of_all_times_and_little_else() -> None:
+    box = BoxCheck().smaller(renderer(4.0), views(), 0.5, 0.0)
+    assert box is not None
+    ends = torch.tensor([[-0.9, -0.3, -0.3], [0.9, 0.3, 0.3]])
+    cell = 0.25
+    assert (box[0] <= ends[0]).all()
+    assert (box[1] >= ends[1]).all()
+    assert (box - ends).abs().max() <= 2 * cell  # matter may begin anywhere in its cell, and pictures widen it
+
+
+def test_room_is_left_on_all_sides_but_not_beyond_the_box() -> None:
+    check, model = BoxCheck(), renderer(4.0)
+    tight, wide = check.smaller(model, views(), 0.5, 0.0), check.smaller(model, views(), 0.5, 0.25)
+    all_of_it = check.smaller(model, views(), 0.5, 10.0)
+    assert tight is not None
+    assert wide is not None
+    assert all_of_it is not None
+    side = float((tight[1] - tight[0]).max())
+    torch.testing.assert_close(wide - tight, 0.25 * side * torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    torch.testing.assert_close(all_of_it, torch.tensor([[-4.0] * 3, [4.0] * 3]))
+
+
+def test_a_box_that_fits_is_left_alone() -> None:
+    assert BoxCheck().smaller(renderer(1.2), views(), 0.5, 0.0) is None
+
+
+def test_matter_that_no_view_sees_counts_for_nothing() -> None:
+    hidden = renderer(4.0, Balls(stray=(3.5, 3.5, -3.5)))
+    assert BoxCheck(min_views=0.0).smaller(hidden, views(), 0.5, 0.0) is None
+    found = BoxCheck().smaller(hidden, views(), 0.5, 0.0)
+    torch.testing.assert_close(found, BoxCheck().smaller(renderer(4.0), views(), 0.5, 0.0))
+
+
+def test_matter_that_views_see_counts_wherever_it_is() -> None:
+    found = BoxCheck().smaller(renderer(8.0, Balls(stray=(1.5, 1.5, 0.0))), views(), 0.5, 0.0)
+    assert found is not None
+    assert (found[1, :2] >= 1.8).all()
+
+
+def test_samplers_that_know_nothing_need_their_box() -> None:
+    blind = Renderer(Balls(), StratifiedSampler(8, [[-4.0] * 3, [4.0] * 3]), ConstantBackground("white"))
+    assert BoxCheck().smaller(blind, views(), 0.5, 0.0) is None
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31))
+def test_the_share_of_views_is_that_of_rays_that_pass(seed: int) -> None:
+    """A place on the ray of a view's pixel, between its planes, is seen by it; behind the planes it is not."""
+    frames = views(1)
+    generator = torch.Generator().manual_seed(seed)
+    pixel = torch.randint(64, (1,), generator=generator)
+    rays = frames.camera(0).rays(0.0, pixel)
+    ends = torch.stack([rays.near, rays.far])
+    inside = torch.lerp(ends[0], ends[1], torch.rand(1, generator=generator).clamp(0.001, 0.999))
+    for distance, expected in ((inside, 1.0), (0.99 * ends[0], 0.0), (1.01 * ends[1], 0.0), (-inside, 0.0)):
+        place = rays.origins + distance[:, None] * rays.directions
+        assert share_of_views(frames, place).tolist() == [expected]
+
+
+def test_half_of_opposite_views_see_what_lies_behind_the_far_plane_of_the_other_half() -> None:
+    poses = torch.stack([look_at((4.0, 0.0, 0.0), (0.0, 0.0, 0.0)), look_at((-4.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
+    frames = Frames(torch.zeros(2, 8, 8, 3, dtype=torch.uint8), poses, torch.zeros(2), Intrinsics.from_angle(8, 8, 0.7))
+    places = torch.tensor([[0.0, 0.0, 0.0], [2.5, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    # 2.5 is 1.5 in front of the first camera, nearer than its near plane at 2, and 6.5 from the other.
+    assert share_of_views(frames, places).tolist() == [1.0, 0.0, 0.0]
+    assert share_of_views(frames, torch.tensor([[-1.99, 0.0, 0.0]])).tolist() == [1.0]
+    assert Camera(frames.intrinsics, poses[0]).project(places[:1])[1].tolist() == pytest.approx([4.0])
+
+
+def training(check: BoxCheck | None, **options: object) -> Trainer:
+    return Trainer(
+        num_steps=3, num_rays=16, losses={"rgb": PhotometricLoss()}, progress_bar=False, box_check=check, **options
+    )
+
+
+def test_training_ends_before_its_first_step_when_views_do_not_reach_the_box() -> None:
+    model = renderer(20.0)
+    model.sampler.occupy(torch.ones(1, 1, 1, 1, dtype=torch.bool))
+    with pytest.raises(BoxTooLarge, match="step 0") as found:
+        training(BoxCheck()).fit(model, views(), seconds=2.5)
+    assert found.value.seconds == 2.5
+    low, high = torch.tensor(found.value.box)
+    assert (low < -1).all()
+    assert (high > 1).all()
+    assert (high - low).max() < 16
+
+
+def test_training_ends_at_a_later_check_when_matter_is_found() -> None:
+    model = renderer(2.9)
+    model.sampler.occupy(torch.ones(1, 1, 1, 1, dtype=torch.bool))
+    model.sampler.update_every = 2
+    with pytest.raises(BoxTooLarge) as found:
+        training(BoxCheck(every=2, until=2)).fit(model, views())
+    assert found.value.step == 2
+    assert found.value.seconds > 0
+
+
+def test_training_goes_on_after_the_last_check() -> None:
+    model = renderer(2.9)
+    model.sampler.occupy(torch.ones(1, 1, 1, 1, dtype=torch.bool))
+    model.sampler.update_every = 2
+    assert training(BoxCheck(every=2, until=1)).fit(model, views()).step == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"every": 0}, "every must be"),
+        ({"until": 0}, "until must be"),
+        ({"shrink_below": 1.0}, "shrink_below must be in"),
+        ({"min_views": 1.0}, "min_views must be in"),
+        ({"room": -0.1}, "room must be"),
+    ],
+)
+def test_numbers_out_of_range_are_named(options: dict[str, float], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        BoxCheck(**options)  # type: ignore[arg-type]
