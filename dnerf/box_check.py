@@ -2,12 +2,14 @@
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool3d
 
 from dnerf.checks import check_positive
 from dnerf.data.frames import Frames
 from dnerf.renderer import Renderer
 
 SHRINK_AT_ONCE = 0.9
+BLOCK = 2  # cells
 
 
 class BoxTooLarge(Exception):
@@ -30,7 +32,7 @@ class BoxCheck:
     """Looks early in training how much of the box matter needs.
 
     Grids, lattices and occupancy share out a fixed number of cells, so a box four times as long means cells four times
-    as long and a blurred picture. Before the first step it is known what the cameras see, after a few hundred steps
+    as long and a blurred picture. Before the first step it is known what the cameras reach, after a few hundred steps
     what is occupied. If that is much smaller than the box, all that is lost by beginning anew in a smaller one is those
     steps. Nothing that is seen and occupied at any time lies outside the smaller one.
 
@@ -56,13 +58,14 @@ class BoxCheck:
         min_views: float = 0.05,
         room: float = 0.1,
     ) -> None:
-        for name, value in (("every", every), ("until", until)):
+        for name, value in (("every", every), ("until", until), ("shrink_below", shrink_below)):
             check_positive(name, value)
-        if not 0 < shrink_below < 1:
+        for name, value in (("min_views", min_views), ("room", room)):
+            check_positive(name, value, allow_zero=True)
+        if shrink_below >= 1:
             raise ValueError(f"shrink_below must be in (0, 1), got {shrink_below}")
-        if not 0 <= min_views < 1:
+        if min_views >= 1:
             raise ValueError(f"min_views must be in [0, 1), got {min_views}")
-        check_positive("room", room, allow_zero=True)
         self.every = every
         self.until = until
         self.shrink_below = shrink_below
@@ -83,38 +86,63 @@ class BoxCheck:
         """
         if step % self.every or step > self.until:
             return
-        shrink_below, room = (SHRINK_AT_ONCE, 0.0) if step == 0 else (self.shrink_below, self.room)
-        box = self.smaller(renderer, frames, shrink_below, room)
+        box = self.smaller(renderer, frames, of_matter=step > 0)
         if box is not None:
             raise BoxTooLarge(step, seconds, box.tolist())
 
-    def smaller(self, renderer: Renderer, frames: Frames, shrink_below: float, room: float) -> Tensor | None:
+    def smaller(self, renderer: Renderer, frames: Frames, *, of_matter: bool) -> Tensor | None:
         """Corners (2, 3) of the box that is enough, or None if it is not much smaller.
 
         Args:
             renderer: whose sampler is asked where matter is; one that does not know needs all of its box.
             frames: of the training.
-            shrink_below: see `BoxCheck`.
-            room: likewise.
+            of_matter: whether it is to be enough for matter; otherwise for what the cameras reach.
         """
         known = renderer.sampler.cells_at_any_time()
         if known is None:
             return None
         box, mask = (values.cpu() for values in known)
-        cells, size = mask.nonzero(), torch.tensor(mask.shape)
-        centers = torch.lerp(box[0], box[1], (cells + 0.5) / size)
-        cells = cells[share_of_views(frames, centers.to(frames.poses.device)).cpu() >= self.min_views]
+        if not of_matter:
+            return _within(box, reach(frames).cpu(), SHRINK_AT_ONCE)
+        cells = self._seen(frames, box, mask).nonzero()
         if not len(cells):
             return None
-        corners = torch.lerp(box[0], box[1], torch.stack([cells.amin(0), cells.amax(0) + 1]) / size)
-        side = (corners[1] - corners[0]).max()
-        if side >= shrink_below * (box[1] - box[0]).max():
-            return None
-        widened = corners + room * side * corners.new_tensor([[-1.0], [1.0]])
-        return torch.minimum(torch.maximum(widened, box[0]), box[1])
+        corners = torch.lerp(box[0], box[1], torch.stack([cells.amin(0), cells.amax(0) + 1]) / torch.tensor(mask.shape))
+        return _within(box, corners, self.shrink_below, self.room)
+
+    def _seen(self, frames: Frames, box: Tensor, mask: Tensor) -> Tensor:
+        """The cells (Gx, Gy, Gz) of a mask that enough views see; they are asked for blocks of cells."""
+        blocks = max_pool3d(mask[None, None].float(), BLOCK, ceil_mode=True)[0, 0] > 0
+        centers = torch.lerp(box[0], box[1], (blocks.nonzero() + 0.5) * BLOCK / torch.tensor(mask.shape))
+        share = share_of_views(frames, centers.to(frames.poses.device)).cpu()
+        blocks[blocks.clone()] = share >= self.min_views
+        for axis, count in enumerate(mask.shape):
+            blocks = blocks.repeat_interleave(BLOCK, axis).narrow(axis, 0, count)
+        return mask & blocks
 
 
-def share_of_views(frames: Frames, positions: Tensor, most: int = 64) -> Tensor:
+def _within(box: Tensor, corners: Tensor, shrink_below: float, room: float = 0.0) -> Tensor | None:
+    """The part of a box within corners, if that is much shorter, with room around it; None if it is not."""
+    needed = torch.minimum(torch.maximum(corners, box[0]), box[1])
+    side = (needed[1] - needed[0]).max()
+    if not 0 < side < shrink_below * (box[1] - box[0]).max():
+        return None
+    return torch.minimum(torch.maximum(needed + room * side * needed.new_tensor([[-1.0], [1.0]]), box[0]), box[1])
+
+
+def reach(frames: Frames) -> Tensor:
+    """Corners (2, 3) of the smallest box that holds what views show between their planes."""
+    width, height = frames.intrinsics.width, frames.intrinsics.height
+    corners = torch.tensor([0, width - 1, width * (height - 1), width * height - 1], device=frames.poses.device)
+    ends = []
+    for index in range(len(frames)):
+        rays = frames.camera(index).rays(0.0, corners)
+        ends += [rays.origins + distances[:, None] * rays.directions for distances in (rays.near, rays.far)]
+    places = torch.cat(ends)
+    return torch.stack([places.amin(0), places.amax(0)])
+
+
+def share_of_views(frames: Frames, positions: Tensor, most: int = 32) -> Tensor:
     """The share (N,) of views between whose planes, and within whose picture, positions (N, 3) lie.
 
     Args:

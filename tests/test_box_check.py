@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dnerf.backgrounds import ConstantBackground
-from dnerf.box_check import BoxCheck, BoxTooLarge, share_of_views
+from dnerf.box_check import BoxCheck, BoxTooLarge, reach, share_of_views
 from dnerf.cameras import Camera, Intrinsics, look_at, orbit_path
 from dnerf.compositing import FieldOutput
 from dnerf.data.frames import Frames
@@ -56,7 +56,7 @@ def renderer(half: float, field: RadianceField | None = None) -> Renderer:
 
 
 def test_the_smaller_box_holds_matter_of_all_times_and_little_else() -> None:
-    box = BoxCheck().smaller(renderer(4.0), views(), 0.5, 0.0)
+    box = BoxCheck(room=0).smaller(renderer(4.0), views(), of_matter=True)
     assert box is not None
     ends = torch.tensor([[-0.9, -0.3, -0.3], [0.9, 0.3, 0.3]])
     cell = 0.25
@@ -66,9 +66,8 @@ def test_the_smaller_box_holds_matter_of_all_times_and_little_else() -> None:
 
 
 def test_room_is_left_on_all_sides_but_not_beyond_the_box() -> None:
-    check, model = BoxCheck(), renderer(4.0)
-    tight, wide = check.smaller(model, views(), 0.5, 0.0), check.smaller(model, views(), 0.5, 0.25)
-    all_of_it = check.smaller(model, views(), 0.5, 10.0)
+    model = renderer(4.0)
+    tight, wide, all_of_it = (BoxCheck(room=room).smaller(model, views(), of_matter=True) for room in (0.0, 0.25, 10.0))
     assert tight is not None
     assert wide is not None
     assert all_of_it is not None
@@ -78,25 +77,27 @@ def test_room_is_left_on_all_sides_but_not_beyond_the_box() -> None:
 
 
 def test_a_box_that_fits_is_left_alone() -> None:
-    assert BoxCheck().smaller(renderer(1.2), views(), 0.5, 0.0) is None
+    assert BoxCheck().smaller(renderer(1.2), views(), of_matter=True) is None
+    assert BoxCheck().smaller(renderer(1.2), views(), of_matter=False) is None
 
 
 def test_matter_that_no_view_sees_counts_for_nothing() -> None:
     hidden = renderer(4.0, Balls(stray=(3.5, 3.5, -3.5)))
-    assert BoxCheck(min_views=0.0).smaller(hidden, views(), 0.5, 0.0) is None
-    found = BoxCheck().smaller(hidden, views(), 0.5, 0.0)
-    torch.testing.assert_close(found, BoxCheck().smaller(renderer(4.0), views(), 0.5, 0.0))
+    assert BoxCheck(min_views=0.0).smaller(hidden, views(), of_matter=True) is None
+    found = BoxCheck().smaller(hidden, views(), of_matter=True)
+    torch.testing.assert_close(found, BoxCheck().smaller(renderer(4.0), views(), of_matter=True))
 
 
 def test_matter_that_views_see_counts_wherever_it_is() -> None:
-    found = BoxCheck().smaller(renderer(8.0, Balls(stray=(1.5, 1.5, 0.0))), views(), 0.5, 0.0)
+    found = BoxCheck(room=0).smaller(renderer(8.0, Balls(stray=(1.5, 1.5, 0.0))), views(), of_matter=True)
     assert found is not None
     assert (found[1, :2] >= 1.8).all()
 
 
 def test_samplers_that_know_nothing_need_their_box() -> None:
     blind = Renderer(Balls(), StratifiedSampler(8, [[-4.0] * 3, [4.0] * 3]), ConstantBackground("white"))
-    assert BoxCheck().smaller(blind, views(), 0.5, 0.0) is None
+    assert BoxCheck().smaller(blind, views(), of_matter=True) is None
+    assert BoxCheck().smaller(blind, views(), of_matter=False) is None
 
 
 @settings(max_examples=30, deadline=None)
@@ -112,6 +113,35 @@ def test_the_share_of_views_is_that_of_rays_that_pass(seed: int) -> None:
     for distance, expected in ((inside, 1.0), (0.99 * ends[0], 0.0), (1.01 * ends[1], 0.0), (-inside, 0.0)):
         place = rays.origins + distance[:, None] * rays.directions
         assert share_of_views(frames, place).tolist() == [expected]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31))
+def test_every_place_that_a_view_shows_is_within_reach(seed: int) -> None:
+    frames = views(5)
+    low, high = reach(frames)
+    generator = torch.Generator().manual_seed(seed)
+    index = int(torch.randint(5, (), generator=generator))
+    rays = frames.camera(index).rays(0.0)
+    places = (
+        rays.origins + torch.lerp(rays.near, rays.far, torch.rand(64, generator=generator))[:, None] * rays.directions
+    )
+    assert ((low - 1e-5 <= places) & (places <= high + 1e-5)).all()
+
+
+def test_the_reach_ends_where_a_corner_of_a_picture_does() -> None:
+    pose = look_at((4.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    lens = Intrinsics.from_angle(9, 9, 2 * math.atan(0.5))
+    frames = Frames(torch.zeros(1, 9, 9, 3, dtype=torch.uint8), pose[None], torch.zeros(1), lens)
+    across = 6 * 0.5 * 8 / 9  # from pixel centre to pixel centre at the far plane
+    expected = torch.tensor([[-2.0, -across, -across], [2.0, across, across]])
+    torch.testing.assert_close(reach(frames), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("half", [5.0, 100.0, 1e4])
+def test_what_cameras_reach_is_enough_of_any_box(half: float) -> None:
+    found = BoxCheck().smaller(renderer(half), views(), of_matter=False)
+    torch.testing.assert_close(found, reach(views()))
 
 
 def test_half_of_opposite_views_see_what_lies_behind_the_far_plane_of_the_other_half() -> None:
@@ -136,10 +166,7 @@ def test_training_ends_before_its_first_step_when_views_do_not_reach_the_box() -
     with pytest.raises(BoxTooLarge, match="step 0") as found:
         training(BoxCheck()).fit(model, views(), seconds=2.5)
     assert found.value.seconds == 2.5
-    low, high = torch.tensor(found.value.box)
-    assert (low < -1).all()
-    assert (high > 1).all()
-    assert (high - low).max() < 16
+    torch.testing.assert_close(torch.tensor(found.value.box), reach(views()))
 
 
 def test_training_ends_at_a_later_check_when_matter_is_found() -> None:
@@ -165,6 +192,7 @@ def test_training_goes_on_after_the_last_check() -> None:
         ({"every": 0}, "every must be"),
         ({"until": 0}, "until must be"),
         ({"shrink_below": 1.0}, "shrink_below must be in"),
+        ({"shrink_below": "half"}, "shrink_below must be a number"),
         ({"min_views": 1.0}, "min_views must be in"),
         ({"room": -0.1}, "room must be"),
     ],

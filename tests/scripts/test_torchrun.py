@@ -48,6 +48,14 @@ def test_two_processes_train_the_model_that_one_does_and_it_continues_with_eithe
     assert "continuing after step 20" in more.stdout
 
 
+def test_processes_begin_anew_in_a_smaller_box_together(tmp_path: Path) -> None:
+    job = torchrun(tmp_path, "trainer.num_steps=8", "out_dir=two", "data.box=[[-4,-4,-4],[4,4,4]]")
+    out, err = job.communicate(timeout=600)
+    assert job.returncode == 0, err
+    assert out.count("beginning anew") == 1
+    assert [line["step"] for line in log_lines(tmp_path / "two")] == list(range(1, 9))
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_stopped_or_dead_process_ends_the_job_and_it_continues(tmp_path: Path, number: signal.Signals) -> None:
     job = torchrun(tmp_path, "trainer.num_steps=1000000", "out_dir=run")
