@@ -43,7 +43,7 @@ class BoxCheck:
             large; before the first step, when nothing is lost, `SHRINK_AT_ONCE`.
         min_views: share of the training views, in [0, 1), that see a place which counts: where fewer look, a field may
             hold anything. See `share_of_views`.
-        room: left at each face, as a share of the longest side: ends of what moves may not have been found yet.
+        room: left at each face around matter, as a share of the longest side: its ends may not have been found yet.
 
     Raises:
         ValueError: for numbers out of range.

@@ -94,6 +94,7 @@ def _fit(
 ) -> TrainingRecord | BoxTooLarge:
     """Train the model until the end, or until its box turns out to be far too large."""
     renderer, trainer = model
+    box_fit = config.get("box_fit")  # runs of before it was there have none
     callbacks: list[Callable[..., None]] = []
     if processes.is_first:
         size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
@@ -109,10 +110,10 @@ def _fit(
             checkpoints=CheckpointFolder(folder / "checkpoints"),
             resume=resume,
             processes=processes,
-            seconds=0.0 if config.box_fit is None else config.box_fit.seconds,
+            seconds=0.0 if box_fit is None else box_fit.seconds,
         )
     except BoxTooLarge as found:
-        return found.with_traceback(None)
+        return found.with_traceback(None)  # which holds the model
 
 
 def _is_scored(folder: Path, config: DictConfig, training: dict[str, Any]) -> bool:
