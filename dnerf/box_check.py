@@ -32,7 +32,7 @@ class BoxCheck:
     """Looks early in training how much of the box matter needs.
 
     Grids, lattices and occupancy share out a fixed number of cells, so a box four times as long means cells four times
-    as long and a blurred picture. Before the first step it is known what the cameras reach, after a few hundred steps
+    as long and a blurred picture. Before the first step it is known what the cameras see, after a few hundred steps
     what is occupied. If that is much smaller than the box, all that is lost by beginning anew in a smaller one is those
     steps. Nothing that is seen and occupied at any time lies outside the smaller one.
 
@@ -96,19 +96,22 @@ class BoxCheck:
         Args:
             renderer: whose sampler is asked where matter is; one that does not know needs all of its box.
             frames: of the training.
-            of_matter: whether it is to be enough for matter; otherwise for what the cameras reach.
+            of_matter: whether it is to be enough for matter; otherwise for what the cameras reach, or, if that is
+                nearly all of the box, for what enough of them see.
         """
         known = renderer.sampler.cells_at_any_time()
         if known is None:
             return None
         box, mask = (values.cpu() for values in known)
-        if not of_matter:
-            return _within(box, reach(frames).cpu(), SHRINK_AT_ONCE)
-        cells = self._seen(frames, box, mask).nonzero()
+        # Cells of a box that is larger by far are too long to tell what views see.
+        reached = None if of_matter else _within(box, reach(frames).cpu(), SHRINK_AT_ONCE)
+        if reached is not None:
+            return reached
+        cells = self._seen(frames, box, mask if of_matter else torch.ones_like(mask)).nonzero()
         if not len(cells):
             return None
         corners = torch.lerp(box[0], box[1], torch.stack([cells.amin(0), cells.amax(0) + 1]) / torch.tensor(mask.shape))
-        return _within(box, corners, self.shrink_below, self.room)
+        return _within(box, corners, *((self.shrink_below, self.room) if of_matter else (SHRINK_AT_ONCE, 0.0)))
 
     def _seen(self, frames: Frames, box: Tensor, mask: Tensor) -> Tensor:
         """The cells (Gx, Gy, Gz) of a mask that enough views see; they are asked for blocks of cells."""

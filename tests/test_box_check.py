@@ -144,6 +144,22 @@ def test_what_cameras_reach_is_enough_of_any_box(half: float) -> None:
     torch.testing.assert_close(found, reach(views()))
 
 
+def test_of_what_cameras_reach_that_is_enough_which_several_see() -> None:
+    low, high = reach(views())
+    half = float(torch.maximum(-low, high).max())
+    model = renderer(half)
+    all_of_it = BoxCheck(min_views=0).smaller(model, views(), of_matter=False)
+    some = BoxCheck(min_views=0.4).smaller(model, views(), of_matter=False)
+    assert all_of_it is None
+    assert some is not None
+    x = torch.linspace(-half, half, 100)
+    line = torch.stack([x, 0 * x, 0 * x], -1)
+    seen = x[share_of_views(views(), line) >= 0.4]
+    cell = 2 * half / 32
+    assert some[0, 0] <= seen.min() + 2 * cell
+    assert some[1, 0] >= seen.max() - 2 * cell
+
+
 def test_half_of_opposite_views_see_what_lies_behind_the_far_plane_of_the_other_half() -> None:
     poses = torch.stack([look_at((4.0, 0.0, 0.0), (0.0, 0.0, 0.0)), look_at((-4.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
     frames = Frames(torch.zeros(2, 8, 8, 3, dtype=torch.uint8), poses, torch.zeros(2), Intrinsics.from_angle(8, 8, 0.7))
