@@ -8,8 +8,8 @@ from dnerf.checks import check_positive
 from dnerf.data.frames import Frames
 from dnerf.renderer import Renderer
 
-SHRINK_AT_ONCE = 0.9
-BLOCK = 2  # cells
+SHRINK_AT_ONCE = 0.9  # of the box's longest side: beginning anew before the first step costs nothing
+BLOCK = 2  # cells of which views are asked at once: an eighth of the work
 
 
 class BoxTooLarge(Exception):

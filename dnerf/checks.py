@@ -43,14 +43,16 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
         raise ValueError(f"{name} must be {bound} and finite, got {value}")
 
 
-def check_mapping(name: str, value: object) -> None:
-    """Raise unless `value` holds values by name.
+def check_mapping(name: str, values: object, *, allow_zero: bool = False) -> None:
+    """Raise unless `values` holds positive (or, where allowed, zero) finite numbers by name.
 
     Raises:
-        ValueError: naming the argument and its value.
+        ValueError: naming the argument, and the number that is none.
     """
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{name} must hold values by name, got {value!r}")
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{name} must hold values by name, got {values!r}")
+    for key, value in values.items():
+        check_positive(f"{name}.{key}", value, allow_zero=allow_zero)
 
 
 def check_choice(name: str, value: object, choices: Sequence[object]) -> None:

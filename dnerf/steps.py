@@ -131,6 +131,35 @@ class Steps:
         return {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse, **shown}.items()}
 
 
+def warm_up(renderer: Renderer, frames: Frames) -> None:
+    """Run every kernel once, forward and backward, so that their compilation is not timed.
+
+    No parameter changes; a sampler that observes sees the untrained field at a few points.
+    """
+    generator = torch.Generator(frames.images.device).manual_seed(0)
+    indices = torch.randint(frames.num_pixels, (64,), generator=generator, device=generator.device)
+    loss = renderer(frames.pixels(indices)[0], generator=generator).rgb.sum()
+    if loss.requires_grad:
+        loss.backward()
+    renderer.zero_grad(set_to_none=True)
+
+
+def next_num_rays(num_rays: int, num_samples: int, target: int, most: int, *, is_fixed: bool, step: int) -> int:
+    """How many rays to take next, of which so many took `num_samples` samples where `target` are wanted.
+
+    Args:
+        num_rays: of the last step.
+        num_samples: that they took.
+        target: samples of a step.
+        most: bound of the number of rays.
+        is_fixed: whether samples have fixed places; how many were wanted is known every `LOOK_EVERY` steps then.
+        step: steps done.
+    """
+    if not is_fixed:
+        return int(min(max(num_rays * target / max(num_samples, 1), num_rays / 2, 1), num_rays * 2, most))
+    return rays_that_fit(num_rays, num_samples / target, most) if step % LOOK_EVERY == 0 else num_rays
+
+
 def rays_that_fit(num_rays: int, fullness: float, most: int) -> int:
     """How many rays to take next, of which so many filled that share of their fixed places."""
     if FULL[0] <= fullness <= FULL[1]:

@@ -22,7 +22,7 @@ from dnerf.records import Callback, Outcome, TrainingRecord, check_finite, psnr_
 from dnerf.recovery import SHOWN, Recovery
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder, RunState, advice_on_memory, fingerprint, max_bytes
-from dnerf.steps import LOOK_EVERY, Steps, rays_that_fit
+from dnerf.steps import Steps, next_num_rays, warm_up
 from dnerf.stopping import StopRequest, TrainingStopped, stop_requests
 from dnerf.time_window import TimeWindow
 
@@ -96,20 +96,15 @@ class Trainer:
         recovery: Recovery | None = None,
         box_check: BoxCheck | None = None,
     ) -> None:
-        check_mapping("learning_rates", learning_rates or {})
+        check_mapping("learning_rates", learning_rates or {}, allow_zero=True)
         check_mapping("loss_every", loss_every or {})
         for name, value in (
-            ("num_steps", num_steps),
-            ("num_rays", num_rays),
-            ("max_rays", max_rays),
-            ("final_learning_rate", final_learning_rate),
-            ("log_every", log_every),
-            ("marched_per_sample", marched_per_sample),
+            ("num_steps", num_steps), ("num_rays", num_rays), ("max_rays", max_rays), ("log_every", log_every),
+            ("final_learning_rate", final_learning_rate), ("marched_per_sample", marched_per_sample),
             ("checkpoint_every", 1 if checkpoint_every is None else checkpoint_every),
             ("max_seconds", 1 if max_seconds is None else max_seconds),
             ("target_samples", 1 if target_samples is None else target_samples),
-            *((f"loss_every.{name}", every) for name, every in (loss_every or {}).items()),
-        ):
+        ):  # fmt: skip
             check_positive(name, value)
         check_choice("schedule", schedule, SCHEDULES)
         for name, every in (loss_every or {}).items():
@@ -125,8 +120,6 @@ class Trainer:
         self.learning_rates = {"": 5e-4} if learning_rates is None else dict(learning_rates)
         if "" not in self.learning_rates:
             raise ValueError(f"learning_rates must have a default under '', got {self.learning_rates}")
-        for prefix, rate in self.learning_rates.items():
-            check_positive(f"learning_rates.{prefix}", rate, allow_zero=True)
         self.schedule = schedule
         self.final_learning_rate = final_learning_rate
         self.warmup_steps = warmup_steps
@@ -194,7 +187,7 @@ class Trainer:
         renderer.train()
         places = self._places(processes)
         renderer.sampler.fix_sizes(None if places is None else int(self.marched_per_sample * places), places)
-        self._warm_up(renderer, frames)
+        warm_up(renderer, frames)
         if resume and checkpoints is not None:
             self._restore(run, checkpoints, processes)
         if self.recovery is not None:
@@ -238,11 +231,11 @@ class Trainer:
             seconds = run.seconds + time.perf_counter() - begin
             run.seconds, num_samples, signal = processes.agree(seconds, outcome.num_samples, request.number)
             run.step += 1
-            used_rays, wanted_rays = run.num_rays, self._next_num_rays(run.num_rays, num_samples)
-            if self.graphs and self.target_samples is not None:
-                is_known = run.step % LOOK_EVERY == 0
-                fullness = num_samples / self.target_samples
-                wanted_rays = rays_that_fit(used_rays, fullness, self.max_rays) if is_known else used_rays
+            used_rays = wanted_rays = run.num_rays
+            if self.target_samples is not None:
+                wanted_rays = next_num_rays(
+                    used_rays, num_samples, self.target_samples, self.max_rays, is_fixed=self.graphs, step=run.step
+                )
             run.rays_done, run.num_rays = run.rays_done + used_rays, max(wanted_rays, processes.size)
             ends = self._is_finished(run)
             saves = checkpoints is not None and bool(ends or signal or self._is_due(run.step))
@@ -277,18 +270,6 @@ class Trainer:
         )
         run.record = vars(record)
         return record
-
-    def _warm_up(self, renderer: Renderer, frames: Frames) -> None:
-        """Run every kernel once, forward and backward, so that their compilation is not timed.
-
-        No parameter changes; a sampler that observes sees the untrained field at a few points.
-        """
-        generator = torch.Generator(frames.images.device).manual_seed(0)
-        indices = torch.randint(frames.num_pixels, (64,), generator=generator, device=generator.device)
-        loss = renderer(frames.pixels(indices)[0], generator=generator).rgb.sum()
-        if loss.requires_grad:
-            loss.backward()
-        renderer.zero_grad(set_to_none=True)
 
     def _places(self, processes: Processes) -> int | None:
         """Places that each process has for samples, if their number is fixed."""
@@ -332,12 +313,6 @@ class Trainer:
             indices, run.step + 1, weight, lambda: processes.same_randomness(generator, num_rays)
         )
         return Outcome(scalars, weight, num_samples, factor)
-
-    def _next_num_rays(self, num_rays: int, num_samples: int) -> int:
-        if self.target_samples is None:
-            return num_rays
-        wanted = num_rays * self.target_samples / max(num_samples, 1)
-        return int(min(max(wanted, num_rays / 2, 1), num_rays * 2, self.max_rays))
 
     def _restore(self, run: RunState, checkpoints: CheckpointFolder, processes: Processes) -> None:
         data = processes.from_first(lambda: checkpoints.read(max_bytes(run.modules)))

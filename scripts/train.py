@@ -38,23 +38,21 @@ def main(config: DictConfig) -> None:
 
 def train(config: DictConfig, resume: bool, device: torch.device, processes: Processes, held: ExitStack) -> None:
     """Build data, model and trainer; train; save weights, logs and scores in the run's folder."""
-    torch.manual_seed(config.seed)
     data = build(config.data)
-    model = build(config.renderer).to(device), build(config.trainer)
+    model = _model(config, device)
     frames = data.frames("train")  # after what can be refused in no time: exact frames are rendered first
     name = processes.from_first(lambda: str(held.enter_context(opened(config))).encode())
     assert name is not None
     folder = Path(name.decode())
     found = _fit(config, model, folder, data, frames, resume, processes, held)
     while isinstance(found, BoxTooLarge):
-        box = [[round(value, 4) for value in corner] for corner in found.box]
+        box = [[float(f"{value:.6g}") for value in corner] for corner in found.box]
         config = in_box(config, box, found.seconds)
         if processes.is_first:
             print(f"{folder}: after {found.seconds:.0f} s: the box can be {box}; beginning anew in there")
             CheckpointFolder(folder / "checkpoints").clear()
             save_config(folder, config)
-        torch.manual_seed(config.seed)
-        model = build(config.renderer).to(device), build(config.trainer)
+        model = _model(config, device)
         found = _fit(config, model, folder, data, frames, resume, processes, held)
     record, (renderer, _) = found, model
     num_parameters = sum(p.numel() for p in renderer.parameters())
@@ -80,6 +78,12 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
             ),
             folder,
         )
+
+
+def _model(config: DictConfig, device: torch.device) -> tuple[Renderer, Trainer]:
+    """A model as the seed makes it, and its trainer."""
+    torch.manual_seed(config.seed)
+    return build(config.renderer).to(device), build(config.trainer)
 
 
 def _fit(

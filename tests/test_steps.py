@@ -18,7 +18,7 @@ from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
-from dnerf.steps import ROUND_TO, Steps, rays_that_fit
+from dnerf.steps import LOOK_EVERY, ROUND_TO, Steps, next_num_rays, rays_that_fit
 from dnerf.training import Trainer
 
 
@@ -228,3 +228,19 @@ def test_the_clock_waits_for_the_device(frames: Frames) -> None:
     trainer = Trainer(num_steps=5, num_rays=64, losses={"slow": Slow()}, log_every=1, progress_bar=False)
     record = trainer.fit(small_renderer(device="cuda"), frames)
     assert record.seconds > 0.8 * 5e-3 * ends[0].elapsed_time(ends[1])
+
+
+@pytest.mark.parametrize(
+    ("num_rays", "num_samples", "expected"),
+    [(100, 2000, 50), (100, 800, 125), (100, 10, 200), (200, 10, 300), (100, 10**9, 50), (100, 0, 200)],
+)
+def test_rays_adapt_to_the_wanted_samples_by_a_factor_of_two_at_most(num_rays, num_samples, expected):
+    assert next_num_rays(num_rays, num_samples, 1000, 300, is_fixed=False, step=7) == expected
+
+
+def test_with_fixed_places_rays_change_only_when_it_is_known_how_full_they_are():
+    unknown, known = (
+        next_num_rays(5000, 400, 1000, 1 << 20, is_fixed=True, step=step) for step in (LOOK_EVERY - 1, LOOK_EVERY)
+    )
+    assert unknown == 5000
+    assert known == rays_that_fit(5000, 0.4, 1 << 20) != 5000

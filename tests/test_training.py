@@ -108,16 +108,6 @@ def test_longest_prefix_gives_the_learning_rate():
         assert rates[id(parameter)] == (3.0 if name.startswith("field.deformation") else 2.0)
 
 
-def test_rays_adapt_to_the_wanted_number_of_samples():
-    made = trainer(target_samples=1000, max_rays=300)
-    assert made._next_num_rays(100, 2000) == 50
-    assert made._next_num_rays(100, 800) == 125
-    assert made._next_num_rays(100, 10) == 200  # at most doubled
-    assert made._next_num_rays(200, 10) == 300  # bounded
-    assert made._next_num_rays(100, 10**9) == 50  # at most halved
-    assert trainer()._next_num_rays(100, 10) == 100
-
-
 def test_broken_loss_is_reported_with_step_and_parameters(frames):
     renderer = small_renderer()
     with torch.no_grad():

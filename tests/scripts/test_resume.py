@@ -109,14 +109,14 @@ def test_a_run_in_a_box_that_is_too_large_goes_on_in_less_and_can_be_continued(t
 
 
 def test_checkpoints_of_the_box_that_was_too_large_are_gone(tmp_path: Path) -> None:
-    """What has been trained until matter is found does not fit the smaller model."""
+    """What has been trained until matter is found does not fit the smaller model, which `resume=true` would read."""
     changes = (
         "trainer.num_steps=12", "trainer.checkpoint_every=2", "trainer.box_check.every=4", "sampler.resolution=64",
         "trainer.box_check.room=0", "trainer.box_check.shrink_below=0.99",
         "data.box=[[-3.25,-3.25,-3.25],[3.25,3.25,3.25]]",
     )  # fmt: skip
     # What views reach is taken at once, the 0.97 of it that they see well only later on.
-    done = train(tmp_path, *changes)
+    done = train(tmp_path, *changes, "resume=true")
     assert done.returncode == 0, done.stderr
     assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["box_fit"]["seconds"] > 0
     assert [line["step"] for line in log_lines(tmp_path / "run")] == list(range(1, 13))
