@@ -72,21 +72,10 @@ class MLP(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Map (..., in_features) -> (..., out_features)."""
         x = inputs
-        if self.hidden and not self.skips:
+        if self.hidden and not self.skips and self.activation is torch.relu_:
             layers = [cast(nn.Linear, layer) for layer in self.hidden]
-            x = dense_layers(x, [layer.weight for layer in layers], [layer.bias for layer in layers], self.activation)
+            x = relu_layers(x, [layer.weight for layer in layers], [layer.bias for layer in layers])
         else:
             for i, layer in enumerate(self.hidden):
                 x = self.activation(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
         return x if self.output is None else self.output(x)
-
-
-def dense_layers(
-    inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], activation: Callable[[Tensor], Tensor]
-) -> Tensor:
-    """Layers of given weights, each with its activation (one of `ACTIVATIONS`): (..., A) -> (..., B)."""
-    if activation is torch.relu_:
-        return relu_layers(inputs, weights, biases)
-    for weight, bias in zip(weights, biases, strict=True):
-        inputs = activation(nn.functional.linear(inputs, weight, bias))
-    return inputs

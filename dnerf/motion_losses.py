@@ -7,6 +7,7 @@ Derivatives in space and time are finite differences, since compiled kernels are
 
 import math
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from dnerf.checks import check_positive
 from dnerf.compositing import Rendering
-from dnerf.deformations import Deformation, FlowDeformation, LatticeFlow, SkippingFlow
+from dnerf.deformations import Deformation, Flow, LatticeFlow, SkippingFlow
 from dnerf.fields import DeformedField, RadianceField
 from dnerf.losses import Loss
 from dnerf.renderer import Renderer
@@ -175,11 +176,11 @@ class MotionLoss(DeformationLoss):
         ValueError: as `DeformationLoss`, and when used, for a renderer whose deformation is no flow.
     """
 
-    def _subject(self, renderer: Renderer) -> FlowDeformation:
+    def _subject(self, renderer: Renderer) -> Flow:
         deformation = renderer.field.deformation if isinstance(renderer.field, DeformedField) else None
         if isinstance(deformation, LatticeFlow | SkippingFlow):
             deformation = deformation.flow
-        if not isinstance(deformation, FlowDeformation):
+        if not isinstance(deformation, Flow):
             raise ValueError(
                 f"{type(self).__name__} needs a renderer whose deformation is a flow, got {type(deformation).__name__}"
             )
@@ -200,12 +201,14 @@ class SmoothVelocityLoss(MotionLoss):
         check_positive("distance", distance)
         self.distance = distance
 
-    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
-        """Squared Frobenius norm of the velocity's gradient."""
-        velocity = flow.velocity.at(points.times)
-        here = velocity(points.positions)
-        changes = [velocity(points.positions + step) - here for step in _steps(points.positions, self.distance)]
-        return torch.stack(changes).square().sum((0, -1)) / self.distance**2
+    def penalty(self, flow: Flow, points: MotionPoints) -> Tensor:
+        """Squared Frobenius norm of the velocity's gradient, summed over a chain's flows."""
+        steps = _steps(points.positions, self.distance)
+        total = torch.zeros_like(points.times)
+        for velocities in _around(flow, points, torch.cat([torch.zeros_like(steps[:1]), steps])):
+            changes = (velocities[1:] - velocities[0]) / self.distance
+            total = total + changes.square().sum((0, -1))
+        return total
 
 
 class DivergenceLoss(MotionLoss):
@@ -222,14 +225,14 @@ class DivergenceLoss(MotionLoss):
         check_positive("distance", distance)
         self.distance = distance
 
-    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
-        """Squared trace of the velocity's gradient."""
-        velocity = flow.velocity.at(points.times)
-        divergence = torch.zeros_like(points.times)
-        for axis, step in enumerate(_steps(points.positions, self.distance)):
-            change = velocity(points.positions + step) - velocity(points.positions - step)
-            divergence = divergence + change[:, axis] / (2 * self.distance)
-        return divergence.square()
+    def penalty(self, flow: Flow, points: MotionPoints) -> Tensor:
+        """Squared trace of the velocity's gradient; of a chain's, which may compress and expand in turn, the sum."""
+        steps = _steps(points.positions, self.distance)
+        total = torch.zeros_like(points.times)
+        for velocities in _around(flow, points, torch.cat([steps, -steps])):
+            ahead, behind = velocities.chunk(2)
+            total = total + (ahead - behind).diagonal(dim1=0, dim2=2).sum(-1) / (2 * self.distance)
+        return total.square()
 
 
 class AccelerationLoss(MotionLoss):
@@ -251,7 +254,7 @@ class AccelerationLoss(MotionLoss):
             raise ValueError(f"interval must be in (0, 0.5], got {interval}")
         self.interval = interval
 
-    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
+    def penalty(self, flow: Flow, points: MotionPoints) -> Tensor:
         """Squared second difference of the track."""
         canonical = flow(points.positions, points.times)
         middle = points.times.clamp(self.interval, 1 - self.interval)
@@ -273,7 +276,7 @@ class CycleConsistencyLoss(MotionLoss):
     def __init__(self, weight: float = 1.0, num_points: int = 1024) -> None:
         super().__init__(weight, num_points)
 
-    def penalty(self, flow: FlowDeformation, points: MotionPoints) -> Tensor:
+    def penalty(self, flow: Flow, points: MotionPoints) -> Tensor:
         """Squared distance after the round trip by the uncorrected inverse."""
         back = flow.reverse(flow(points.positions, points.times), points.times)
         return (back - points.positions).square().sum(-1)
@@ -286,6 +289,20 @@ def spread_directions(like: Tensor) -> Tensor:
     radius = (1 - height.square()).clamp(min=0).sqrt()
     angle = GOLDEN_ANGLE * number
     return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), height], dim=-1)
+
+
+def _around(flow: Flow, points: MotionPoints, steps: Tensor) -> Iterator[Tensor]:
+    """Velocities (K, M, 3) of each flow of a chain, at the M points where they enter it, moved by K steps (K, 3).
+
+    Times its duration: of flows without a canonical time what counts is the way.
+    """
+    positions, links = points.positions, flow.links()
+    for k in range(len(links)):
+        if k:
+            with torch.no_grad():
+                positions = links[k - 1](positions, points.times)
+        places = positions + steps[:, None]
+        yield links[k].duration * links[k].velocity(places, points.times.expand(places.shape[:-1]))
 
 
 def _steps(like: Tensor, distance: float) -> Tensor:

@@ -5,6 +5,7 @@ from dnerf.deformations.base import Deformation, InvertibleDeformation
 from dnerf.deformations.displacement import DisplacementDeformation
 from dnerf.deformations.fixed_point import invert
 from dnerf.deformations.flow import FlowDeformation
+from dnerf.deformations.flow_chain import Flow, FlowChain
 from dnerf.deformations.frame_lattice import FrameLattice, FrozenDeformation
 from dnerf.deformations.identity import IdentityDeformation
 from dnerf.deformations.lattice_flow import LatticeFlow
@@ -14,6 +15,8 @@ from dnerf.deformations.solvers import IntegrationError
 __all__ = [
     "Deformation",
     "DisplacementDeformation",
+    "Flow",
+    "FlowChain",
     "FlowDeformation",
     "FrameLattice",
     "FrozenDeformation",

@@ -8,7 +8,7 @@ from torch import Tensor
 from dnerf.checks import check_positive
 from dnerf.deformations.base import InvertibleDeformation, check_positions_times
 from dnerf.deformations.fixed_point import attach_gradient, invert
-from dnerf.deformations.flow import FlowDeformation
+from dnerf.deformations.flow_chain import Flow
 from dnerf.deformations.space_time import SpaceTimeLattice
 
 
@@ -35,7 +35,7 @@ class LatticeFlow(InvertibleDeformation):
 
     def __init__(
         self,
-        flow: FlowDeformation,
+        flow: Flow,
         box: Sequence[Sequence[float]],
         resolution: int = 24,
         num_knots: int = 33,

@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from dnerf.checks import as_box, check_positive
 from dnerf.deformations.base import InvertibleDeformation, check_positions_times
-from dnerf.deformations.flow import FlowDeformation
+from dnerf.deformations.flow_chain import Flow
 
 
 class SkippingFlow(InvertibleDeformation):
@@ -37,7 +37,7 @@ class SkippingFlow(InvertibleDeformation):
 
     def __init__(
         self,
-        flow: FlowDeformation,
+        flow: Flow,
         box: Sequence[Sequence[float]],
         resolution: int = 32,
         *,

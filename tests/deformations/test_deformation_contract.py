@@ -9,6 +9,7 @@ from torch import Tensor
 from dnerf.deformations import (
     Deformation,
     DisplacementDeformation,
+    FlowChain,
     FlowDeformation,
     IdentityDeformation,
     InvertibleDeformation,
@@ -40,6 +41,12 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
     "flow, grid and network": lambda: FlowDeformation(GridVelocity(BOX, 3, 5, hidden_features=8), num_steps=4),
     "flow, curl": lambda: FlowDeformation(CurlVelocity(BOX, 4, 8, max_wavenumber=0.5, time_frequencies=2), num_steps=4),
     "flow, rigid": lambda: FlowDeformation(RigidVelocity(BOX, 3, 8, time_frequencies=2), num_steps=4),
+    "flows in a row": lambda: FlowChain(
+        {
+            name: FlowDeformation(network_velocity(), None, clock="frozen", solver="euler", num_steps=1)
+            for name in ("first", "second")
+        }
+    ),
     "flow on a lattice": lambda: LatticeFlow(FlowDeformation(network_velocity(), num_steps=2), BOX, 9, 5, pad_to=64),
     "flow that skips": lambda: SkippingFlow(FlowDeformation(network_velocity(), num_steps=4), BOX, 4, pad_to=16),
 }

@@ -1,15 +1,14 @@
 """Velocity as a small network of position and time."""
 
-import math
 from collections.abc import Callable, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dnerf.checks import check_positive
 from dnerf.deformations.velocities.base import BoxWindow, Velocity
 from dnerf.encodings import SinusoidalEncoding
-from dnerf.mlp import ACTIVATIONS, MLP, dense_layers
+from dnerf.mlp import MLP
 
 
 class NetworkVelocity(Velocity):
@@ -50,22 +49,14 @@ class NetworkVelocity(Velocity):
         self.window = BoxWindow(box, margin, smoothness)
         self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
         self.encode_times = SinusoidalEncoding(1, time_frequencies)
-        self.from_positions = nn.Linear(self.encode_positions.out_features, hidden_features, bias=False)
-        self.from_times = nn.Linear(self.encode_times.out_features, hidden_features)
-        # As one layer of both inputs would start.
-        bound = math.sqrt(6 / (self.encode_positions.out_features + self.encode_times.out_features))
-        for layer in (self.from_positions, self.from_times):
-            nn.init.uniform_(layer.weight, -bound, bound)
-        nn.init.zeros_(self.from_times.bias)
         self.mlp = MLP(
+            self.encode_positions.out_features + self.encode_times.out_features,
             hidden_features,
-            hidden_features,
-            num_layers - 1,
+            num_layers,
             out_features=3,
             zero_output=True,
             activation=activation,
         )
-        self.activation = ACTIVATIONS[activation]
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Velocity (..., 3) at positions (..., 3) and times (...,)."""
@@ -74,12 +65,10 @@ class NetworkVelocity(Velocity):
     def at(self, times: Tensor) -> Callable[[Tensor], Tensor]:
         """The field at fixed times."""
         of_times = self.encode_times(times[..., None])
-        weight, bias = torch.cat([self.from_positions.weight, self.from_times.weight], dim=-1), self.from_times.bias
 
         def velocity(positions: Tensor) -> Tensor:
             inside = self.window.inside(positions)
             inputs = torch.cat([*self.encode_positions.parts(inside), of_times], dim=-1)
-            hidden = dense_layers(inputs, [weight], [bias], self.activation)
-            return self.window(positions) * self.mlp(hidden).to(positions.dtype)
+            return self.window(positions) * self.mlp(inputs).to(positions.dtype)
 
         return velocity
