@@ -6,7 +6,7 @@ from torch import Tensor
 
 from dnerf.benchmarks.closed_flows import Expansion, Rotation, Shear
 from dnerf.compositing import FieldOutput, Rendering
-from dnerf.deformations import Deformation, DisplacementDeformation, FlowDeformation, LatticeFlow
+from dnerf.deformations import Deformation, DisplacementDeformation, FlowChain, FlowDeformation, LatticeFlow
 from dnerf.deformations.folding import folding
 from dnerf.deformations.velocities import NetworkVelocity, Velocity
 from dnerf.fields import DeformedField, GridField, RadianceField
@@ -58,6 +58,49 @@ def test_smoothness_of_linear_fields_is_the_norm_of_their_matrix() -> None:
 def test_divergence_of_linear_fields_is_their_trace() -> None:
     assert value(DivergenceLoss(1.0), Expansion(1.5)) == pytest.approx((3 * 1.5) ** 2, rel=1e-5)
     assert value(DivergenceLoss(1.0), Rotation(2.0)) < 1e-9
+
+
+def value_of_chain(loss: torch.nn.Module, *links: tuple[Velocity, float]) -> float:
+    """A loss of a chain of Euler steps, each of a velocity and for a duration, on points of which all count alike."""
+    settings = {"canonical_time": None, "clock": "frozen", "solver": "euler", "num_steps": 1}
+    flows = [FlowDeformation(velocity, duration=duration, **settings) for velocity, duration in links]
+    chain = FlowChain({f"flow_{i}": flow for i, flow in enumerate(flows)})
+    picture = rendering()
+    picture.weights.fill_(1.0)
+    picture.output.extras["positions"].fill_(0.25)
+    renderer = Renderer(DeformedField(chain, make_scene("static")), StratifiedSampler(4))
+    return float(loss(picture, torch.zeros(8, 3), renderer).detach())
+
+
+def test_a_chain_may_expand_and_compress_in_turn() -> None:
+    assert value_of_chain(DivergenceLoss(1.0), (Expansion(1.5), 0.5), (Expansion(-1.5), 0.5)) < 1e-9
+    once = value_of_chain(DivergenceLoss(1.0), (Expansion(1.5), 0.5), (Expansion(0.5), 0.25))
+    assert once == pytest.approx((3 * (1.5 * 0.5 + 0.5 * 0.25)) ** 2, rel=1e-5)
+
+
+def test_roughness_of_a_chain_is_that_of_its_ways_together() -> None:
+    found = value_of_chain(SmoothVelocityLoss(1.0), (Expansion(1.5), 0.5), (Rotation(2.0), 0.25))
+    assert found == pytest.approx(3 * (1.5 * 0.5) ** 2 + 2 * (2.0 * 0.25) ** 2, rel=1e-5)
+
+
+def test_a_chain_is_judged_where_points_enter_each_flow() -> None:
+    class Uniform(Velocity):
+        def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+            return torch.ones_like(positions)
+
+    class Quadratic(Velocity):
+        def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+            return positions.square()
+
+    # Points at 0.25 enter the second flow at 0.75; the divergence there is 3 * 2 * 0.75.
+    found = value_of_chain(DivergenceLoss(1.0), (Uniform(), 0.5), (Quadratic(), 1.0))
+    assert found == pytest.approx((6 * 0.75) ** 2, rel=1e-6)
+
+
+def test_cycle_of_a_chain_is_the_miss_of_both_steps() -> None:
+    """Two Euler steps of an expansion: x (1 + a)(1 + b) there, times (1 - b)(1 - a) back."""
+    found = value_of_chain(CycleConsistencyLoss(1.0), (Expansion(0.5), 0.5), (Expansion(0.8), 0.5))
+    assert found == pytest.approx(3 * (0.25 * (1 - (1 - 0.25**2) * (1 - 0.4**2))) ** 2, rel=1e-5)
 
 
 class Linear(Deformation):
