@@ -12,11 +12,10 @@ from dnerf.deformations.flow import EvaluationCounts, FlowDeformation
 class FlowChain(InvertibleDeformation):
     """Flows one after the other, each from where the one before ended.
 
-    With frozen clocks it is one flow whose velocity is another in each part of the way,
-    `dx/ds = K v_k(x, t)` for s in [k / K, (k + 1) / K): every invertible map near the identity is such a chain (the
-    non-stationary velocities of large-deformation registration: Beg et al. 2005), but not every one is the
-    exponential of one stationary field. A chain of few coarse steps also bends more than one flow before it folds:
-    determinants multiply, and each flow has to keep to its own bound only (`FlowDeformation`).
+    With frozen clocks it is one flow whose velocity is another in each part of the way, as in registration with large
+    deformations (Beg et al. 2005): it reaches maps that are not the exponential of one stationary field. Where each
+    takes one Euler step they are residual blocks, invertible while each keeps to its own bound (`FlowDeformation`;
+    Behrmann et al. 2019), so a chain bends more than one flow before it folds: determinants multiply.
 
     Args:
         flows: by name, in the order in which world positions meet them.
