@@ -1,6 +1,7 @@
 """Checks of arguments at public doors: one line that names the argument, what was expected and what came."""
 
 from collections.abc import Mapping, Sequence
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -36,7 +37,7 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
     Raises:
         ValueError: naming the argument and its value.
     """
-    if isinstance(value, str):
+    if not isinstance(value, Real):
         raise ValueError(f"{name} must be a number, got {value!r}")
     if not (value > 0 or (allow_zero and value == 0)) or value == float("inf"):
         bound = ">= 0" if allow_zero else "> 0"

@@ -1,6 +1,7 @@
 """Checks of arguments say what was expected and what came."""
 
 import math
+import re
 
 import pytest
 import torch
@@ -42,9 +43,10 @@ def test_numbers_that_are_not_positive_and_finite_are_refused(value: float) -> N
         check_positive("radius", value)
 
 
-def test_text_is_no_number() -> None:
-    with pytest.raises(ValueError, match="radius must be a number, got 'abc'"):
-        check_positive("radius", "abc")  # type: ignore[arg-type]
+@pytest.mark.parametrize("value", ["abc", None, [1.0], {}])
+def test_what_is_no_number_is_named(value: object) -> None:
+    with pytest.raises(ValueError, match=f"radius must be a number, got {re.escape(repr(value))}"):
+        check_positive("radius", value)  # type: ignore[arg-type]
 
 
 def test_zero_is_allowed_where_asked_for() -> None:
