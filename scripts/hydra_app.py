@@ -170,7 +170,7 @@ def resolve_device(name: str) -> torch.device:
     """The device of a name; "auto" is CUDA where there is one. Under torchrun "cuda" is each process's own GPU.
 
     Raises:
-        ValueError: for an unknown device or one that is not there.
+        ValueError: for an unknown device or one that is not there, or more processes than GPUs.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -181,7 +181,13 @@ def resolve_device(name: str) -> torch.device:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {name!r} was asked for, but torch sees no CUDA device")
     if device.type == "cuda" and device.index is None and is_launched():
-        return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        index, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+        if index >= count:
+            raise ValueError(
+                f"device {name!r} gives each process a GPU of its own, but this one is number {index} here and torch "
+                f"sees {count}; start fewer (--nproc_per_node={count}) or ask for device=cpu"
+            )
+        return torch.device("cuda", index)
     return device
 
 

@@ -54,7 +54,7 @@ def main(config: DictConfig) -> None:
     if config.data_root is not None:
         saved.data.root = config.data_root
     share = Share(int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
-    device = _own_device(config.device)
+    device = resolve_device(config.device)
     renderer = load_renderer(config.run, saved, device)
     _split(renderer, config.splits)
     data = build(saved.data)
@@ -104,13 +104,6 @@ def _split(renderer: Renderer, splits: object) -> None:
 
 def _listed(value: str | ListConfig) -> list[str]:
     return [value] if isinstance(value, str) else list(value)
-
-
-def _own_device(name: str) -> torch.device:
-    device = resolve_device(name)
-    if device == torch.device("cuda") and "LOCAL_RANK" in os.environ:
-        return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-    return device
 
 
 def _output(config: DictConfig, formats: list[str]) -> Path:

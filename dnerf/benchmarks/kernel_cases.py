@@ -22,6 +22,7 @@ from dnerf.kernels import (
     footprints,
     grid_encode,
     march,
+    march_to_size,
     packed_sum,
     packed_weights,
     relu_layers,
@@ -142,12 +143,7 @@ class Workload:
         grid_back = grid_bytes + features * n + 6 * n + 4 * NUM_FEATURES * used_rows + self.table.nbytes
         out = 5 * 4 * len(self.rays)
         cases = [
-            Case(
-                "march",
-                "forward",
-                _backends(lambda: self._march(self.jitter)),
-                40 * len(self.rays) + (4 + 4 + 8) * self.num_samples,
-            ),
+            Case("march", "forward", _backends(lambda: self._march(self.jitter)), self._marching_bytes()),
             Case(
                 "brick_lookup",
                 "forward",
@@ -176,7 +172,19 @@ class Workload:
                 (6 * n + out, 18 * n + 2 * out),
             ),
         ]
-        return cases if self.points.is_cuda else cases + self._compiled_on_cpus_alone()
+        return cases + (self._compiled_on_gpus_alone() if self.points.is_cuda else self._compiled_on_cpus_alone())
+
+    def _marching_bytes(self) -> int:
+        return 40 * len(self.rays) + (4 + 4 + 8) * self.num_samples
+
+    def _compiled_on_gpus_alone(self) -> list[Case]:
+        """Kernels that CPUs run by their definition."""
+        r, step = self.rays, torch.tensor(STEP, device=self.points.device)
+        to_size = partial(
+            march_to_size, r.origins, r.directions, r.near, r.far, times=r.times, jitter=self.jitter,
+            occupancy=self.occupancy, aabb=self.box, step=step, size=self.num_samples,
+        )  # fmt: skip
+        return [Case("march_to_size", "forward", _backends(to_size), self._marching_bytes())]
 
     def _compiled_on_cpus_alone(self) -> list[Case]:
         """Kernels that GPUs run by their definition."""

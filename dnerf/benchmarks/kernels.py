@@ -7,12 +7,15 @@ import torch
 from dnerf.benchmarks.kernel_cases import COMPILED, PLAIN, REFERENCE, Case, Workload
 from dnerf.benchmarks.machine import Rates, measure_rates
 from dnerf.benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
-from dnerf.benchmarks.timing import num_threads, time_in_turn
+from dnerf.benchmarks.timing import num_threads, recorded, time_in_turn
+
+RAYS = {"cpu": (512, 2048, 8192), "cuda": (1024, 8192, 65536)}  # of a batch
+RUNS = 20  # of a call in a CUDA graph
 
 
 def run(settings: Settings) -> SuiteResult:
     """Time every kernel, forward and backward, on the samples of a batch of rays through a hollow ball."""
-    counts = (256, 1024) if settings.quick else (512, 2048, 8192)
+    counts = (256, 1024) if settings.quick else RAYS[settings.device]
     cores = torch.get_num_threads()
     rates = measure_rates(settings.device, seconds=0.15 if settings.quick else 1.0)
     rows: list[dict[str, Any]] = []
@@ -30,7 +33,8 @@ def run(settings: Settings) -> SuiteResult:
             "training step of `experiment=fast` has them (`trace`: a frame; `skip_distances`, `few_nonzero` and "
             "`covered_places`: a whole grid, whatever the samples): the compiled version (numba or oneDNN on the CPU, "
             "Triton on a GPU), the reference that defines it, and the quickest form in plain torch that we know. "
-            "Variants run in turn; medians with quartiles. The limit is the least number of bytes (inputs, outputs and "
+            "Variants run in turn; medians with quartiles. On a GPU calls are replayed from a CUDA graph, as training "
+            "does, where they do not wait for the device. The limit is the least number of bytes (inputs, outputs and "
             "table rows in use, once each) at the copy bandwidth measured in the same run; a gather from a table that "
             "fits into a cache reads each row many times, so no program reaches it."
         ),
@@ -45,7 +49,11 @@ def run(settings: Settings) -> SuiteResult:
 
 def _measure(case: Case, samples: int, threads: int, rates: Rates, settings: Settings) -> list[dict[str, Any]]:
     seconds = 0.3 if settings.quick else 1.0
-    timings = time_in_turn(case.calls, seconds=seconds, min_repeats=3, device=settings.device)
+    replays = {}
+    if settings.device == "cuda":
+        replays = {name: graph for name, call in case.calls.items() if (graph := recorded(call, RUNS))}
+    timings = time_in_turn({**case.calls, **replays}, seconds=seconds, min_repeats=3, device=settings.device)
+    timings = {name: timing.of_each(RUNS if name in replays else 1) for name, timing in timings.items()}
     limit = case.num_bytes / rates.bandwidth
     return [
         {
@@ -54,6 +62,7 @@ def _measure(case: Case, samples: int, threads: int, rates: Rates, settings: Set
             "samples": samples,
             "threads": threads,
             "variant": variant,
+            "replayed": variant in replays,
             **timing.milliseconds,
             "times_compiled": timing.median / timings[COMPILED].median,
             "limit_ms": 1e3 * limit,

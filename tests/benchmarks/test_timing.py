@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dnerf.benchmarks.machine import Rates, describe_machine, measure_rates
-from dnerf.benchmarks.timing import fitted_order, num_threads, summarize, time_in_turn
+from dnerf.benchmarks.timing import fitted_order, num_threads, recorded, summarize, time_in_turn
 
 
 def test_calls_take_turns_and_the_first_round_does_not_count():
@@ -26,6 +26,23 @@ def test_medians_tell_slow_from_quick():
 
 def test_summary_is_median_and_quartiles():
     assert vars(summarize([5.0, 1.0, 3.0, 2.0, 4.0])) == {"median": 3.0, "low": 2.0, "high": 4.0, "count": 5}
+
+
+def test_a_call_of_many_runs_tells_what_one_takes():
+    assert vars(summarize([4.0, 8.0, 12.0]).of_each(4)) == {"median": 2.0, "low": 1.5, "high": 2.5, "count": 3}
+
+
+@pytest.mark.gpu
+def test_recorded_runs_are_replayed_unless_they_wait_for_the_device():
+    total = torch.zeros((), device="cuda")
+    replay = recorded(lambda: total.add_(1), 5)
+    assert replay is not None
+    before = float(total)
+    replay()
+    assert float(total) == before + 5
+    assert recorded(lambda: total.item(), 5) is None
+    with pytest.raises(RuntimeError, match="shape"):
+        recorded(lambda: total.new_zeros(2) @ total.new_zeros(3, 3), 5)
 
 
 def test_number_of_threads_is_put_back():
