@@ -292,17 +292,14 @@ def spread_directions(like: Tensor) -> Tensor:
 
 
 def _around(flow: Flow, points: MotionPoints, steps: Tensor) -> Iterator[Tensor]:
-    """Velocities (K, M, 3) of each flow of a chain, at the M points where they enter it, moved by K steps (K, 3).
-
-    Times its duration: of flows without a canonical time what counts is the way.
-    """
+    """Velocities (K, M, 3) of each flow of a chain, at the M points where they enter it, moved by K steps (K, 3)."""
     positions, links = points.positions, flow.links()
     for k in range(len(links)):
         if k:
             with torch.no_grad():
                 positions = links[k - 1](positions, points.times)
         places = positions + steps[:, None]
-        yield links[k].duration * links[k].velocity(places, points.times.expand(places.shape[:-1]))
+        yield links[k].velocity(places, points.times.expand(places.shape[:-1]))
 
 
 def _steps(like: Tensor, distance: float) -> Tensor:

@@ -3,6 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Any
 
 import torch
@@ -88,7 +89,8 @@ class AdamMuon(torch.optim.Adam):
 
         Args:
             model: whose parameters are optimised.
-            rates: learning rates by parameter-name prefix; "" is the default, the longest match wins.
+            rates: learning rates by parameter-name prefix, in which * stands for anything; "" is the default, the
+                longest match wins.
             orthogonal: prefixes below which the weights of linear maps of 16 rows and columns or more are orthogonal.
             betas: Adam's moment decay rates.
             eps: Adam's epsilon.
@@ -100,7 +102,7 @@ class AdamMuon(torch.optim.Adam):
         }
         groups: dict[tuple[str, bool], list[nn.Parameter]] = defaultdict(list)
         for name, parameter in model.named_parameters():
-            prefix = max((p for p in rates if name.startswith(p)), key=len)
+            prefix = max((p for p in rates if fnmatchcase(name, p + "*")), key=len)
             groups[prefix, name in matrices].append(parameter)
         listed = [
             {"params": groups[key], "lr": rates[key[0]], "initial_lr": rates[key[0]], "orthogonal": key[1]}

@@ -44,8 +44,9 @@ class Trainer:
         target_samples: field evaluations per step; the number of rays is adapted to it (for samplers that skip empty
             space: rays that meet nothing cost nothing).
         max_rays: bound of the adapted number of rays.
-        learning_rates: by parameter-name prefix of the renderer ("" is the default, the longest match wins); one that
-            matches nothing is ignored, so that one set serves models with and without a part.
+        learning_rates: by parameter-name prefix of the renderer, in which * stands for anything ("" is the default, the
+            longest match wins); one that matches nothing is ignored, so that one set serves models with and without a
+            part.
         schedule: "exponential", "cosine" or "constant".
         final_learning_rate: factor at the end of the schedule.
         warmup_steps: steps over which the factor rises linearly from near zero.

@@ -74,6 +74,10 @@ def test_the_networks_that_move_matter_take_orthogonalised_steps(experiment):
     matrices = [names[id(p)] for group in optimizer.param_groups if group["orthogonal"] for p in group["params"]]
     assert len(matrices) >= 3
     assert all(name.startswith("field.deformation.") for name in matrices)
+    rates = {names[id(p)]: group["lr"] for group in optimizer.param_groups for p in group["params"]}
+    ends = {name for name, rate in rates.items() if rate == rates[matrices[0]] / 4}
+    assert ends == {name for name in rates if ".mlp.output." in name and "deformation" in name}
+    assert len(ends) == (4 if experiment == "flow" else 2)
 
 
 def test_a_time_window_joins_any_experiment():

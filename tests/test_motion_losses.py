@@ -60,11 +60,10 @@ def test_divergence_of_linear_fields_is_their_trace() -> None:
     assert value(DivergenceLoss(1.0), Rotation(2.0)) < 1e-9
 
 
-def value_of_chain(loss: torch.nn.Module, *links: tuple[Velocity, float]) -> float:
-    """A loss of a chain of Euler steps, each of a velocity and for a duration, on points of which all count alike."""
+def value_of_chain(loss: torch.nn.Module, *velocities: Velocity) -> float:
+    """A loss of a chain of Euler steps on points of which all count alike."""
     settings = {"canonical_time": None, "clock": "frozen", "solver": "euler", "num_steps": 1}
-    flows = [FlowDeformation(velocity, duration=duration, **settings) for velocity, duration in links]
-    chain = FlowChain({f"flow_{i}": flow for i, flow in enumerate(flows)})
+    chain = FlowChain({f"flow_{i}": FlowDeformation(v, **settings) for i, v in enumerate(velocities)})
     picture = rendering()
     picture.weights.fill_(1.0)
     picture.output.extras["positions"].fill_(0.25)
@@ -73,33 +72,33 @@ def value_of_chain(loss: torch.nn.Module, *links: tuple[Velocity, float]) -> flo
 
 
 def test_a_chain_may_expand_and_compress_in_turn() -> None:
-    assert value_of_chain(DivergenceLoss(1.0), (Expansion(1.5), 0.5), (Expansion(-1.5), 0.5)) < 1e-9
-    once = value_of_chain(DivergenceLoss(1.0), (Expansion(1.5), 0.5), (Expansion(0.5), 0.25))
-    assert once == pytest.approx((3 * (1.5 * 0.5 + 0.5 * 0.25)) ** 2, rel=1e-5)
+    assert value_of_chain(DivergenceLoss(1.0), Expansion(0.75), Expansion(-0.75)) < 1e-9
+    once = value_of_chain(DivergenceLoss(1.0), Expansion(0.75), Expansion(0.125))
+    assert once == pytest.approx((3 * (0.75 + 0.125)) ** 2, rel=1e-5)
 
 
 def test_roughness_of_a_chain_is_that_of_its_ways_together() -> None:
-    found = value_of_chain(SmoothVelocityLoss(1.0), (Expansion(1.5), 0.5), (Rotation(2.0), 0.25))
-    assert found == pytest.approx(3 * (1.5 * 0.5) ** 2 + 2 * (2.0 * 0.25) ** 2, rel=1e-5)
+    found = value_of_chain(SmoothVelocityLoss(1.0), Expansion(0.75), Rotation(0.5))
+    assert found == pytest.approx(3 * 0.75**2 + 2 * 0.5**2, rel=1e-5)
 
 
 def test_a_chain_is_judged_where_points_enter_each_flow() -> None:
     class Uniform(Velocity):
         def forward(self, positions: Tensor, times: Tensor) -> Tensor:
-            return torch.ones_like(positions)
+            return torch.full_like(positions, 0.5)
 
     class Quadratic(Velocity):
         def forward(self, positions: Tensor, times: Tensor) -> Tensor:
             return positions.square()
 
     # Points at 0.25 enter the second flow at 0.75; the divergence there is 3 * 2 * 0.75.
-    found = value_of_chain(DivergenceLoss(1.0), (Uniform(), 0.5), (Quadratic(), 1.0))
+    found = value_of_chain(DivergenceLoss(1.0), Uniform(), Quadratic())
     assert found == pytest.approx((6 * 0.75) ** 2, rel=1e-6)
 
 
 def test_cycle_of_a_chain_is_the_miss_of_both_steps() -> None:
     """Two Euler steps of an expansion: x (1 + a)(1 + b) there, times (1 - b)(1 - a) back."""
-    found = value_of_chain(CycleConsistencyLoss(1.0), (Expansion(0.5), 0.5), (Expansion(0.8), 0.5))
+    found = value_of_chain(CycleConsistencyLoss(1.0), Expansion(0.25), Expansion(0.4))
     assert found == pytest.approx(3 * (0.25 * (1 - (1 - 0.25**2) * (1 - 0.4**2))) ** 2, rel=1e-5)
 
 
@@ -230,7 +229,7 @@ def test_acceleration_of_a_rotation_is_centripetal() -> None:
 def test_acceleration_of_uniform_motion_is_zero() -> None:
     class Uniform(Velocity):
         def forward(self, positions: Tensor, times: Tensor) -> Tensor:
-            return torch.ones_like(positions)
+            return torch.full_like(positions, 0.5)
 
     assert value(AccelerationLoss(1.0), Uniform()) < 1e-12
     assert value(AccelerationLoss(1.0), Shear(2.0, 5.0)) > 1

@@ -108,6 +108,17 @@ def test_longest_prefix_gives_the_learning_rate():
         assert rates[id(parameter)] == (3.0 if name.startswith("field.deformation") else 2.0)
 
 
+def test_a_star_in_a_learning_rates_name_stands_for_anything():
+    renderer = small_renderer()
+    rates = {"": 1.0, "field.deformation": 2.0, "field.deformation*.output": 3.0, "*nowhere": 4.0}
+    optimizer = trainer(learning_rates=rates).optimizer(renderer)
+    found = {id(p): group["lr"] for group in optimizer.param_groups for p in group["params"]}
+    named = {name: found[id(p)] for name, p in renderer.named_parameters()}
+    assert named["field.deformation.mlp.output.weight"] == named["field.deformation.mlp.output.bias"] == 3.0
+    assert named["field.deformation.mlp.hidden.0.weight"] == 2.0
+    assert set(named.values()) == {1.0, 2.0, 3.0}
+
+
 def test_broken_loss_is_reported_with_step_and_parameters(frames):
     renderer = small_renderer()
     with torch.no_grad():

@@ -38,15 +38,15 @@ class FlowDeformation(InvertibleDeformation):
     - `clock="frozen"`: `dx/ds = (t0 - t) v(x, t)`, the exponential of the field of the sample's own time (log-domain
       diffeomorphisms: Arsigny et al. 2006, Ashburner 2007). As invertible, and the same where v does not depend on
       time, but errors do not add up over long times and few steps suffice: with one Euler step it is D-NeRF's
-      displacement. v is not the physical velocity. With `canonical_time=None` the factor is `duration` instead:
+      displacement. v is not the physical velocity. With `canonical_time=None` the factor is 1:
       no time is canonical.
 
     Both are the identity at initialisation if v is zero, both compose: motion from t to t' is
     `inverse(forward(x, t), t')`.
 
     The exact flow never folds space. Steps of length h keep the Jacobian determinant positive while the norm of the
-    velocity's gradient stays below 1 / h (Euler) or (sqrt(3) - 1) / h (midpoint), h times |t0 - t| or times
-    `duration`; `SmoothVelocityLoss` holds it down in training.
+    velocity's gradient stays below 1 / h (Euler) or (sqrt(3) - 1) / h (midpoint), h times |t0 - t| where
+    there is a canonical time; `SmoothVelocityLoss` holds it down in training.
 
     Args:
         velocity: the field, zero outside the scene's box.
@@ -60,8 +60,6 @@ class FlowDeformation(InvertibleDeformation):
         max_steps: of an adaptive solver.
         corrections: round trips by which `inverse` is made the inverse of the *discretised* `forward` (see `invert`):
             the equation solved backwards, which 0 leaves as it is, misses it by both solves' errors.
-        duration: how far a flow without a canonical time goes, `dx/ds = duration v(x, t)`: with an optimiser whose
-            steps have a given size, how fast it learns.
 
     Raises:
         ValueError: for settings out of range, or a running clock without a canonical time.
@@ -80,14 +78,10 @@ class FlowDeformation(InvertibleDeformation):
         gradient: str = "direct",
         max_steps: int = 1000,
         corrections: int = 10,
-        duration: float = 1.0,
     ) -> None:
         super().__init__()
         check_choice("clock", clock, CLOCKS)
         check_positive("corrections", corrections, allow_zero=True)
-        check_positive("duration", duration)
-        if canonical_time is not None and duration != 1:
-            raise ValueError(f"duration must be 1 where there is a canonical time, got {duration}")
         if canonical_time is None and clock == "running":
             raise ValueError("canonical_time must be a time in [0, 1] for a running clock, got None")
         if canonical_time is not None and not 0 <= canonical_time <= 1:
@@ -97,7 +91,6 @@ class FlowDeformation(InvertibleDeformation):
         self.clock = clock
         self.solver = Solver(solver, num_steps, rtol=rtol, atol=atol, gradient=gradient, max_steps=max_steps)
         self.corrections = corrections
-        self.duration = duration
         self.evaluations = EvaluationCounts()
 
     def links(self) -> tuple["FlowDeformation", ...]:
@@ -173,7 +166,7 @@ class FlowDeformation(InvertibleDeformation):
     def _spans(self, times: Tensor, backwards: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Time at s = 0 and at s = 1, and the signed length of the way, (...,) each."""
         if self.canonical_time is None:
-            length = torch.full_like(times, -self.duration if backwards else self.duration)
+            length = torch.full_like(times, -1.0 if backwards else 1.0)
             return times, times, length
         canonical = torch.full_like(times, self.canonical_time)
         start, end = (canonical, times) if backwards else (times, canonical)
