@@ -136,6 +136,20 @@ def transform_points(matrices: Tensor, points: Tensor) -> Tensor:
     return _rotate(matrices[..., :3, :3], points) + matrices[..., :3, 3]
 
 
+def move_by_twists(twists: Tensor, points: Tensor) -> Tensor:
+    """Points (..., 3) carried by the rigid motions of twists (..., 6): `transform_points(se3_exp(twists), points)`,
+    without matrices."""
+    check_last_axis("twists", twists, 6)
+    turning, travelling = twists[..., :3], twists[..., 3:]
+    a, b, c = (x[..., 0] for x in _rotation_coefficients(turning))
+
+    def turned(first: Tensor, second: Tensor, vectors: Tensor) -> Tensor:
+        once = torch.linalg.cross(turning, vectors)
+        return first * once + second * torch.linalg.cross(turning, once)
+
+    return points + turned(a, b, points) + travelling + turned(b, c, travelling)
+
+
 def safe_normalize(vectors: Tensor) -> Tensor:
     """Unit vectors (..., 3); a zero vector stays zero with zero gradient."""
     # Scaled first, since squares of float32 lengths below 1e-19 or above 1e19 leave its range.

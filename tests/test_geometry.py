@@ -12,6 +12,7 @@ from torch import Tensor
 from dnerf.geometry import (
     _rotation_coefficients,
     clip_to_box,
+    move_by_twists,
     ray_box,
     safe_normalize,
     se3_exp,
@@ -178,6 +179,15 @@ def test_se3_exp_is_accurate_in_float32(angle: float) -> None:
     twist = torch.cat([angle * axis_of(0), axis_of(1)])
     # A few float32 roundings of entries of size one.
     torch.testing.assert_close(se3_exp(twist.float()).double(), se3_exp(twist), rtol=0, atol=5e-7)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.5, 3.0])
+def test_points_moved_by_twists_are_those_of_their_matrices(size: float) -> None:
+    twists, points = size * torch.randn(50, 6, dtype=torch.float64), torch.randn(50, 3, dtype=torch.float64)
+    moved = move_by_twists(twists, points)
+    torch.testing.assert_close(moved, transform_points(se3_exp(twists), points), rtol=0, atol=1e-13)
+    inputs = (twists[:4].requires_grad_(), points[:4].requires_grad_())
+    assert torch.autograd.gradcheck(move_by_twists, inputs)
 
 
 def test_rigid_motions_stay_float32_under_autocast() -> None:

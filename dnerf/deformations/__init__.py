@@ -2,7 +2,7 @@
 
 from dnerf.deformations.along_rays import deform_along_rays
 from dnerf.deformations.base import Deformation, InvertibleDeformation
-from dnerf.deformations.displacement import DisplacementDeformation
+from dnerf.deformations.displacement import DisplacementDeformation, SE3Deformation
 from dnerf.deformations.fixed_point import invert
 from dnerf.deformations.flow import FlowDeformation
 from dnerf.deformations.flow_chain import Flow, FlowChain
@@ -24,6 +24,7 @@ __all__ = [
     "IntegrationError",
     "InvertibleDeformation",
     "LatticeFlow",
+    "SE3Deformation",
     "SkippingFlow",
     "deform_along_rays",
     "invert",

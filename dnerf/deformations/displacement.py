@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dnerf.deformations.base import Deformation, check_positions_times
 from dnerf.encodings import SinusoidalEncoding
+from dnerf.geometry import move_by_twists
 from dnerf.mlp import MLP
 
 
@@ -30,6 +31,8 @@ class DisplacementDeformation(Deformation):
         ValueError: if the canonical time lies outside [0, 1].
     """
 
+    NUM_OUTPUTS = 3  # of the MLP
+
     def __init__(
         self,
         num_layers: int = 8,
@@ -51,7 +54,7 @@ class DisplacementDeformation(Deformation):
             self.encode_positions.out_features + self.encode_times.out_features,
             hidden_features,
             num_layers,
-            out_features=3,
+            out_features=self.NUM_OUTPUTS,
             skips=skips,
             zero_output=True,
         )
@@ -62,7 +65,26 @@ class DisplacementDeformation(Deformation):
         encoded = torch.cat(
             [*self.encode_positions.parts(positions), *self.encode_times.parts(times[..., None])], dim=-1
         )
-        offsets = self.mlp(encoded).to(positions.dtype)
+        motion = self.mlp(encoded).to(positions.dtype)
         if self.canonical_time is not None:
-            offsets = offsets * (times[..., None] - self.canonical_time)
-        return positions + offsets
+            motion = motion * (times[..., None] - self.canonical_time)
+        return self._moved(positions, motion)
+
+    def _moved(self, positions: Tensor, motion: Tensor) -> Tensor:
+        """Positions (..., 3) moved by what the MLP says, (..., NUM_OUTPUTS)."""
+        return positions + motion
+
+
+class SE3Deformation(DisplacementDeformation):
+    """A rigid motion for each sample by an MLP: x' = exp((t - t0) f(x, t)) x, f a twist about the origin.
+
+    Where a part moves as a rigid body its twist is the same everywhere, which is less to learn than its displacement.
+
+    Source: Nerfies (arXiv 2011.12948) section 3.2 (twists there have a norm and an axis apart). Arguments and errors
+    as of `DisplacementDeformation`.
+    """
+
+    NUM_OUTPUTS = 6
+
+    def _moved(self, positions: Tensor, motion: Tensor) -> Tensor:
+        return move_by_twists(motion, positions)

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from dnerf.deformations import DisplacementDeformation
+from dnerf.deformations import DisplacementDeformation, SE3Deformation
+from dnerf.geometry import se3_exp, transform_points
 
 
 def trained(**arguments: object) -> DisplacementDeformation:
@@ -61,3 +62,13 @@ def test_shut_window_hides_the_fine_octaves() -> None:
 def test_canonical_time_outside_the_film_is_refused(canonical_time: float) -> None:
     with pytest.raises(ValueError, match=r"canonical_time must be in \[0, 1\] or None"):
         DisplacementDeformation(2, 8, (), canonical_time=canonical_time)
+
+
+def test_a_twist_that_is_the_same_everywhere_is_one_rigid_motion() -> None:
+    deformation = SE3Deformation(2, 16, (), canonical_time=0.25).double()
+    twist = torch.tensor([0.4, -0.5, 0.6, 0.1, 0.2, 0.3], dtype=torch.float64)
+    with torch.no_grad():
+        deformation.mlp.output.bias += twist
+    positions = torch.randn(20, 3, dtype=torch.float64)
+    moved = deformation(positions, torch.full((20,), 0.75, dtype=torch.float64))
+    torch.testing.assert_close(moved, transform_points(se3_exp(0.5 * twist), positions), rtol=0, atol=1e-13)

@@ -21,12 +21,13 @@ BOX = ((-1.0, -2.0, -1.5), (1.0, 2.0, 0.5))
 VELOCITIES: dict[str, Callable[[], Velocity]] = {
     "network": lambda: NetworkVelocity(BOX, 2, 16),
     "network, relu": lambda: NetworkVelocity(BOX, 1, 16, activation="relu", smoothness=1),
+    "network, twists": lambda: NetworkVelocity(BOX, 2, 16, twists=True),
     "grid": lambda: GridVelocity(BOX, 4, 5),
     "grid and network": lambda: GridVelocity(BOX, 4, 5, hidden_features=8),
     "curl": lambda: CurlVelocity(BOX, 8, 16),
     "rigid": lambda: RigidVelocity(BOX, 4, 16),
 }
-SMOOTH = ("network", "curl", "rigid")
+SMOOTH = ("network", "network, twists", "curl", "rigid")
 every_velocity = pytest.mark.parametrize("name", VELOCITIES)
 
 
@@ -158,6 +159,18 @@ def test_one_rigid_cluster_keeps_distances() -> None:
     jacobian = jacobians(velocity, 0.5 * (positions - velocity.window.center) + velocity.window.center, times)
     assert jacobian.abs().max() > 0.1
     torch.testing.assert_close(jacobian + jacobian.mT, torch.zeros_like(jacobian), rtol=0, atol=1e-12)
+
+
+def test_a_twist_that_is_the_same_everywhere_turns_a_rigid_body() -> None:
+    velocity = NetworkVelocity(BOX, 2, 16, twists=True).double()
+    twist = torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6], dtype=torch.float64)
+    with torch.no_grad():
+        velocity.mlp.output.bias += twist
+    positions, times = points(50)
+    center = velocity.window.center
+    positions = 0.5 * (positions - center) + center
+    expected = twist[:3] + torch.linalg.cross(twist[3:].expand(50, 3), positions - center)
+    torch.testing.assert_close(velocity(positions, times), expected, rtol=0, atol=1e-12)
 
 
 def test_rigid_clusters_move_their_own_neighbourhoods() -> None:

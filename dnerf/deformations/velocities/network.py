@@ -14,6 +14,9 @@ from dnerf.mlp import MLP
 class NetworkVelocity(Velocity):
     """v(x, t) = w(x) MLP(x, t), w the window of the box; zero everywhere at initialisation.
 
+    With `twists` the MLP gives a travelling u and a turning omega, v = w (u + omega x (x - c)), c the box's centre:
+    what turns as a rigid body has the same u and omega everywhere, which is less to learn than v.
+
     Where a solver looks several times at the same times (`at`), those are encoded once.
 
     Args:
@@ -26,6 +29,7 @@ class NetworkVelocity(Velocity):
         margin: see `BoxWindow`.
         smoothness: see `BoxWindow`.
         window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
+        twists: see above.
 
     Raises:
         ValueError: for numbers out of range.
@@ -43,9 +47,11 @@ class NetworkVelocity(Velocity):
         margin: float = 0.1,
         smoothness: int = 4,
         window_end: float | None = None,
+        twists: bool = False,
     ) -> None:
         super().__init__()
         check_positive("num_layers", num_layers)
+        self.twists = twists
         self.window = BoxWindow(box, margin, smoothness)
         self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
         self.encode_times = SinusoidalEncoding(1, time_frequencies)
@@ -53,7 +59,7 @@ class NetworkVelocity(Velocity):
             self.encode_positions.out_features + self.encode_times.out_features,
             hidden_features,
             num_layers,
-            out_features=3,
+            out_features=6 if twists else 3,
             zero_output=True,
             activation=activation,
         )
@@ -69,6 +75,11 @@ class NetworkVelocity(Velocity):
         def velocity(positions: Tensor) -> Tensor:
             inside = self.window.inside(positions)
             inputs = torch.cat([*self.encode_positions.parts(inside), of_times], dim=-1)
-            return self.window(positions) * self.mlp(inputs).to(positions.dtype)
+            motion = self.mlp(inputs).to(positions.dtype)
+            if self.twists:
+                travelling, turning = motion.split(3, dim=-1)
+                arms = inside - self.window.center.to(positions.dtype)
+                motion = travelling + torch.linalg.cross(turning, arms)
+            return self.window(positions) * motion
 
         return velocity
