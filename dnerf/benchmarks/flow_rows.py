@@ -13,9 +13,11 @@ from dnerf.checks import check_positive
 from dnerf.deformations import (
     Deformation,
     DisplacementDeformation,
+    FlowChain,
     FlowDeformation,
     IntegrationError,
     LatticeFlow,
+    SE3Deformation,
     SkippingFlow,
 )
 from dnerf.deformations.solvers import ADAPTIVE_SOLVERS, FIXED_SOLVERS
@@ -129,35 +131,41 @@ def _round_trip(flow: FlowDeformation, carried: Tensor, times: Tensor, positions
 
 
 def variants() -> dict[str, Deformation]:
-    """Deformations whose costs are compared, untrained, at the sizes that `conf/deformation` gives them."""
+    """Deformations whose costs are compared, untrained, at the sizes that `conf/deformation` gives them, and others."""
 
     def network(**changes: Any) -> NetworkVelocity:
-        return NetworkVelocity(BOX, **{"activation": "relu", "smoothness": 1, **changes})
+        return NetworkVelocity(BOX, **{"hidden_features": 128, "activation": "relu", "smoothness": 1, **changes})
+
+    def smooth() -> NetworkVelocity:
+        return NetworkVelocity(BOX, 3, 64)
 
     frozen: dict[str, Any] = {"canonical_time": None, "clock": "frozen", "solver": "midpoint", "num_steps": 1}
+    euler: dict[str, Any] = {**frozen, "solver": "euler"}
     running: dict[str, Any] = {"canonical_time": 0.5, "solver": "midpoint", "num_steps": 2}
     exact: dict[str, Any] = {"canonical_time": 0.5, "solver": "rk4", "num_steps": 8}
+    small: dict[str, Any] = {"position_frequencies": 3, "time_frequencies": 5, "canonical_time": None}
     skipping = SkippingFlow(FlowDeformation(network(), **frozen), BOX)
     skipping.motion[:, :, : skipping.motion.shape[2] // 2] = 0
+
+    def chain(**changes: Any) -> FlowChain:
+        return FlowChain({name: FlowDeformation(network(**changes), **euler) for name in ("first", "second")})
+
     return {
-        "displacement (3 x 64)": DisplacementDeformation(
-            3, 64, (), position_frequencies=3, time_frequencies=5, canonical_time=None
-        ),
-        "flow, frozen clock, 1 midpoint step (3 x 64)": FlowDeformation(network(), **frozen),
-        "flow, frozen clock, 1 midpoint step (3 x 48)": FlowDeformation(network(hidden_features=48), **frozen),
-        "flow, frozen clock, 1 midpoint step (2 x 64)": FlowDeformation(network(num_layers=2), **frozen),
+        "displacement (4 x 128)": DisplacementDeformation(4, 128, (), **small),
+        "SE(3) (4 x 128)": SE3Deformation(4, 128, (), **small),
+        "flow, chain of 2 Euler steps of twists (3 x 128)": chain(twists=True),
+        "flow, chain of 2 Euler steps (3 x 128)": chain(),
+        "flow, chain of 2 Euler steps (2 x 128)": chain(num_layers=2),
+        "flow, frozen clock, 1 midpoint step (3 x 128)": FlowDeformation(network(), **frozen),
+        "flow, frozen clock, 1 midpoint step (3 x 64)": FlowDeformation(network(hidden_features=64), **frozen),
         "flow, frozen clock, 1 midpoint step, grid 16^3 x 17": FlowDeformation(GridVelocity(BOX), **frozen),
-        "flow, frozen clock, 1 midpoint step (3 x 64), lower half still and skipped": skipping,
-        "flow, running clock, 2 midpoint steps (3 x 64)": FlowDeformation(network(), **running),
+        "flow, frozen clock, 1 midpoint step (3 x 128), lower half still and skipped": skipping,
+        "flow, running clock, 2 midpoint steps (3 x 128)": FlowDeformation(network(), **running),
         "flow, running clock, 2 midpoint steps, grid 16^3 x 17": FlowDeformation(GridVelocity(BOX), **running),
         "flow, running clock, 2 midpoint steps, curl of 64 waves": FlowDeformation(CurlVelocity(BOX), **running),
         "flow, running clock, 2 midpoint steps, 16 rigid clusters": FlowDeformation(RigidVelocity(BOX), **running),
-        "flow, running clock, 8 RK4 steps (3 x 64, silu)": FlowDeformation(
-            network(activation="silu", smoothness=4), **exact
-        ),
-        "the same on a lattice of 16^3 x 17": LatticeFlow(
-            FlowDeformation(network(activation="silu", smoothness=4), **exact), BOX, 16, 17
-        ),
+        "flow, running clock, 8 RK4 steps (3 x 64, silu)": FlowDeformation(smooth(), **exact),
+        "the same on a lattice of 16^3 x 17": LatticeFlow(FlowDeformation(smooth(), **exact), BOX, 16, 17),
     }
 
 
@@ -221,7 +229,7 @@ def variant_rows(
         rows.append(
             {
                 "variant": name,
-                "evaluations": flow.evaluations.last if isinstance(flow, FlowDeformation) else 1,
+                "evaluations": flow.evaluations.last if isinstance(flow, FlowDeformation | FlowChain) else 1,
                 "points": points,
                 "forward_ms": 1e3 * forward_time.median,
                 "training_ms": 1e3 * training.median,

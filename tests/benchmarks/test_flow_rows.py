@@ -38,10 +38,14 @@ def test_the_network_is_always_the_same_and_moves_points_by_about_half_a_unit() 
 
 
 def test_variant_rows_compare_with_the_first() -> None:
-    names = ("displacement (3 x 64)", "flow, frozen clock, 1 midpoint step (3 x 64)")
+    names = (
+        "displacement (4 x 128)",
+        "flow, frozen clock, 1 midpoint step (3 x 128)",
+        "flow, chain of 2 Euler steps (3 x 128)",
+    )
     rows = variant_rows(names, num_samples=512, num_rays=16, repeats=1, precision=None)
     assert [row["variant"] for row in rows] == list(names)
-    assert [row["evaluations"] for row in rows] == [1, 2]
+    assert [row["evaluations"] for row in rows] == [1, 2, 2]
     assert rows[0]["ratio"] == 1
     with pytest.raises(ValueError, match=r"names must be some of displacement .*; got magic"):
         variant_rows(("magic",))
