@@ -39,6 +39,8 @@ class BoxCheck:
     Args:
         every: steps between checks.
         until: last step at which one is made: haze of a large box takes its time to go.
+        until_spent: share of the seconds that training may take, in [0, 1], after which none is made: what is left has
+            to be worth beginning anew.
         shrink_below: longest side of what is needed, as a share of the box's, in (0, 1), below which the box is too
             large; before the first step, when nothing is lost, `SHRINK_AT_ONCE`.
         min_views: share of the training views, in [0, 1), that see a place which counts: where fewer look, a field may
@@ -54,25 +56,31 @@ class BoxCheck:
         every: int = 32,
         until: int = 512,
         *,
+        until_spent: float = 0.25,
         shrink_below: float = 0.5,
         min_views: float = 0.05,
         room: float = 0.1,
     ) -> None:
         for name, value in (("every", every), ("until", until), ("shrink_below", shrink_below)):
             check_positive(name, value)
-        for name, value in (("min_views", min_views), ("room", room)):
+        for name, value in (("until_spent", until_spent), ("min_views", min_views), ("room", room)):
             check_positive(name, value, allow_zero=True)
+        if until_spent > 1:
+            raise ValueError(f"until_spent must be in [0, 1], got {until_spent}")
         if shrink_below >= 1:
             raise ValueError(f"shrink_below must be in (0, 1), got {shrink_below}")
         if min_views >= 1:
             raise ValueError(f"min_views must be in [0, 1), got {min_views}")
         self.every = every
         self.until = until
+        self.until_spent = until_spent
         self.shrink_below = shrink_below
         self.min_views = min_views
         self.room = room
 
-    def __call__(self, step: int, seconds: float, renderer: Renderer, frames: Frames) -> None:
+    def __call__(
+        self, step: int, seconds: float, renderer: Renderer, frames: Frames, *, max_seconds: float | None = None
+    ) -> None:
         """Check, if it is time.
 
         Args:
@@ -80,11 +88,14 @@ class BoxCheck:
             seconds: of training so far.
             renderer: in training.
             frames: of the training.
+            max_seconds: that training may take, or None.
 
         Raises:
             BoxTooLarge: with the box that is enough.
         """
         if step % self.every or step > self.until:
+            return
+        if step and max_seconds is not None and seconds > self.until_spent * max_seconds:
             return
         box = self.smaller(renderer, frames, of_matter=step > 0)
         if box is not None:

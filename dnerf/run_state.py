@@ -40,6 +40,7 @@ class RunState:
         record: the last record of training as JSON values, or None before the first.
         data: fingerprint of the frames that are learnt, "" if nobody asks.
         rollbacks: how often the run has been brought back, see `dnerf.recovery`.
+        begun: training time that had been spent before the first step.
     """
 
     modules: Mapping[str, nn.Module]
@@ -52,6 +53,7 @@ class RunState:
     record: dict[str, Any] | None = None
     data: str = ""
     rollbacks: int = 0
+    begun: float = 0.0
 
     def encode(self) -> bytes:
         """The state as the bytes of one file."""
@@ -60,6 +62,7 @@ class RunState:
             "device": self.generator.device.type,
             "step": self.step,
             "seconds": self.seconds,
+            "begun": self.begun,
             "num_rays": self.num_rays,
             "rays_done": self.rays_done,
             "rollbacks": self.rollbacks,
@@ -97,7 +100,7 @@ class RunState:
             own = f"{name}."
             module.load_state_dict({k.removeprefix(own): tensors[k] for k in expected if k.startswith(own)})
         self._set_moments(state, parameters)
-        self.step, self.seconds = checked["step"], checked["seconds"]
+        self.step, self.seconds, self.begun = checked["step"], checked["seconds"], checked["begun"]
         self.num_rays, self.rays_done, self.rollbacks = checked["num_rays"], checked["rays_done"], checked["rollbacks"]
         self.record = checked["record"]
 
@@ -152,9 +155,11 @@ def _checked_facts(facts: dict[str, Any] | None, where: object, device: str, max
         value = facts.get(name)
         if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
             raise ValueError(f"{where}: {name} must be a whole number in [{low}, {high}], got {str(value)[:40]}")
-    seconds = facts.get("seconds")
-    if not isinstance(seconds, float) or not 0 <= seconds < math.inf:
-        raise ValueError(f"{where}: seconds must be a number >= 0, got {str(seconds)[:40]}")
+    facts = {"begun": 0.0, **facts}  # checkpoints of before it was there have none
+    for name in ("seconds", "begun"):
+        value = facts.get(name)
+        if not isinstance(value, float) or not 0 <= value < math.inf:
+            raise ValueError(f"{where}: {name} must be a number >= 0, got {str(value)[:40]}")
     if facts.get("record") is not None:
         _check_record(facts["record"], where)
     return {"record": None, **facts}

@@ -34,8 +34,9 @@ BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
 class Trainer:
     """Adam on random rays until `num_steps` or `max_seconds` is reached, whichever comes first.
 
-    Progress p in [0, 1] is the larger of steps done / num_steps and seconds spent / max_seconds; learning rates and
-    encoding windows follow it, so a time-limited run still ends with a finished schedule.
+    Progress p in [0, 1] is the larger of steps done / num_steps and seconds spent / max_seconds (counted from the first
+    step, if some were spent before); learning rates and encoding windows follow it, so a time-limited run still ends
+    with a finished schedule.
 
     Args:
         num_steps: most optimiser steps.
@@ -162,7 +163,7 @@ class Trainer:
             checkpoints: where states are written every `checkpoint_every` steps and at the end, or None.
             resume: continue from the newest checkpoint, if there is one, exactly as if training had never stopped.
             processes: those that train together; None for this one alone.
-            seconds: of `max_seconds` that were spent before; a checkpoint knows its own.
+            seconds: of `max_seconds` that were spent before the first step; a checkpoint knows its own.
 
         Returns:
             The last step's record.
@@ -182,7 +183,7 @@ class Trainer:
         generator = torch.Generator(renderer.device).manual_seed(seed)
         modules = {"renderer": renderer, "losses": self.losses}
         run = RunState(modules, self.optimizer(renderer), generator, max(self.num_rays, processes.size))
-        run.seconds = seconds
+        run.seconds = run.begun = float(seconds)
         if checkpoints is not None:
             run.data = fingerprint(frames)
         renderer.train()
@@ -301,7 +302,7 @@ class Trainer:
         processes.merge_observations(renderer, run.step)
         steps.update(run.step)
         if self.box_check is not None:
-            self.box_check(run.step, run.seconds, renderer, frames)
+            self.box_check(run.step, run.seconds, renderer, frames, max_seconds=self.max_seconds)
         generator, num_rays = run.generator, run.num_rays
         if self.time_window is None:
             indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)
@@ -333,5 +334,8 @@ class Trainer:
         return self.checkpoint_every is not None and step % self.checkpoint_every == 0
 
     def _progress(self, run: RunState) -> float:
-        of_time = 0.0 if self.max_seconds is None else run.seconds / self.max_seconds
+        of_time = 0.0
+        if self.max_seconds is not None:
+            left = self.max_seconds - run.begun
+            of_time = (run.seconds - run.begun) / left if left > 0 else 1.0
         return min(max(run.step / self.num_steps, of_time), 1.0)

@@ -17,7 +17,7 @@ from dnerf.fields import RadianceField
 from dnerf.losses import PhotometricLoss
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, StratifiedSampler
-from dnerf.training import Trainer
+from dnerf.training import Trainer, TrainingRecord
 
 
 class Balls(RadianceField):
@@ -172,7 +172,9 @@ def test_half_of_opposite_views_see_what_lies_behind_the_far_plane_of_the_other_
 
 def training(check: BoxCheck | None, **options: object) -> Trainer:
     return Trainer(
-        num_steps=3, num_rays=16, losses={"rgb": PhotometricLoss()}, progress_bar=False, box_check=check, **options
+        **{"num_steps": 3, "num_rays": 16, "progress_bar": False, **options},
+        losses={"rgb": PhotometricLoss()},
+        box_check=check,
     )
 
 
@@ -202,11 +204,49 @@ def test_training_goes_on_after_the_last_check() -> None:
     assert training(BoxCheck(every=2, until=1)).fit(model, views()).step == 3
 
 
+@pytest.mark.parametrize(("spent", "goes_on"), [(0.0, False), (20.0, False), (26.0, True)])
+def test_training_goes_on_when_too_little_time_is_left(spent: float, goes_on: bool) -> None:
+    model = renderer(2.9)
+    model.sampler.occupy(torch.ones(1, 1, 1, 1, dtype=torch.bool))
+    model.sampler.update_every = 2
+    trainer = training(BoxCheck(every=2, until_spent=0.25), max_seconds=100.0)  # three steps take less than five
+    if goes_on:
+        assert trainer.fit(model, views(), seconds=spent).step == 3
+        return
+    with pytest.raises(BoxTooLarge):
+        trainer.fit(model, views(), seconds=spent)
+
+
+def test_what_cameras_reach_is_asked_for_whatever_time_is_left() -> None:
+    model = renderer(20.0)
+    with pytest.raises(BoxTooLarge, match="step 0"):
+        training(BoxCheck(until_spent=0.0), max_seconds=1.0).fit(model, views(), seconds=0.9)
+
+
+def test_schedules_begin_anew_with_the_training() -> None:
+    """Half of the seconds were spent before: the first step has the full rate."""
+    options = {"num_steps": 10**6, "max_seconds": 100.0, "log_every": 1, "final_learning_rate": 1e-4}
+    factors = []
+
+    class Stop(Exception):
+        pass
+
+    def stop(record: TrainingRecord, *_: object) -> None:
+        factors.append(record.learning_rate_factor)
+        raise Stop
+
+    with pytest.raises(Stop):
+        training(None, **options).fit(renderer(1.2), views(), seconds=50.0, callbacks=[stop])
+    assert factors == [1.0]
+
+
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
         ({"every": 0}, "every must be"),
         ({"until": 0}, "until must be"),
+        ({"until_spent": -0.1}, "until_spent must be"),
+        ({"until_spent": 1.1}, "until_spent must be in"),
         ({"shrink_below": 1.0}, "shrink_below must be in"),
         ({"shrink_below": "half"}, "shrink_below must be a number"),
         ({"min_views": 1.0}, "min_views must be in"),

@@ -50,7 +50,7 @@ def state_of(renderer: Renderer, step: int = 5) -> RunState:
         parameter.grad = torch.rand(parameter.shape, generator=generator)
     optimizer.step()
     record = vars(TrainingRecord(step, 1.25, {"loss": 0.1}, 10.0, 37, 300, 0.5))
-    return RunState({"renderer": renderer}, optimizer, generator, 37, step, 1.25, 99, record, "frames")
+    return RunState({"renderer": renderer}, optimizer, generator, 37, step, 1.25, 99, record, "frames", begun=0.5)
 
 
 def contents(state: RunState) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -73,11 +73,19 @@ def test_a_state_comes_back_exactly() -> None:
     assert_same(saved, restored)
     assert restored.step == 5
     assert restored.seconds == 1.25
+    assert restored.begun == 0.5
     assert torch.rand(3, generator=saved.generator).equal(torch.rand(3, generator=restored.generator))
     expected = saved.optimizer.state_dict()["state"]
     assert {k: v["step"] for k, v in restored.optimizer.state_dict()["state"].items()} == {
         k: v["step"] for k, v in expected.items()
     }
+
+
+def test_a_state_of_before_it_said_when_training_began_began_at_once() -> None:
+    saved, restored = state_of(small_renderer(0)), state_of(small_renderer(1))
+    tensors, facts = contents(saved)
+    restored.restore(encode(tensors, {k: v for k, v in facts.items() if k != "begun"}), "here", max_rays=64)
+    assert restored.begun == 0.0
 
 
 def test_a_state_has_all_that_training_changes() -> None:
@@ -93,6 +101,7 @@ def test_a_state_has_all_that_training_changes() -> None:
         "device",
         "step",
         "seconds",
+        "begun",
         "num_rays",
         "rays_done",
         "rollbacks",
@@ -225,6 +234,7 @@ Edit = Callable[[dict[str, torch.Tensor], dict[str, Any]], object]
         (lambda t, f: f.update(step=2**60), "step"),
         (lambda t, f: f.pop("seconds"), "seconds"),
         (lambda t, f: f.update(seconds="1"), "seconds"),
+        (lambda t, f: f.update(begun=-1.0), "begun"),
         (lambda t, f: f.update(num_rays=10**12), "num_rays"),
         (lambda t, f: f.update(num_rays=0), "num_rays"),
         (lambda t, f: f.update(rays_done=1.5), "rays_done"),
