@@ -56,7 +56,7 @@ class BoxCheck:
         every: int = 32,
         until: int = 512,
         *,
-        until_spent: float = 0.25,
+        until_spent: float = 0.4,
         shrink_below: float = 0.5,
         min_views: float = 0.05,
         room: float = 0.1,
