@@ -1,5 +1,7 @@
 """Boxes that are far too large for what is in them: noticed early in training, so that it can begin anew in less."""
 
+import logging
+
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
@@ -8,7 +10,10 @@ from dnerf.checks import check_positive
 from dnerf.data.frames import Frames
 from dnerf.renderer import Renderer
 
+logger = logging.getLogger(__name__)
+
 SHRINK_AT_ONCE = 0.9  # of the box's longest side: beginning anew before the first step costs nothing
+CUT_SHARE = 3e-3  # of a face's cells: fewer are haze
 BLOCK = 2  # cells of which views are asked at once: an eighth of the work
 
 
@@ -123,6 +128,33 @@ class BoxCheck:
             return None
         corners = torch.lerp(box[0], box[1], torch.stack([cells.amin(0), cells.amax(0) + 1]) / torch.tensor(mask.shape))
         return _within(box, corners, *((self.shrink_below, self.room) if of_matter else (SHRINK_AT_ONCE, 0.0)))
+
+    def warn(self, renderer: Renderer, frames: Frames) -> None:
+        """Log a warning that names the faces that `cut` finds."""
+        if faces := self.cut(renderer, frames):
+            logger.warning("matter reaches the box at %s: what lies beyond is not seen, see data.box", ", ".join(faces))
+
+    def cut(self, renderer: Renderer, frames: Frames) -> list[str]:
+        """Faces of the box at which matter ends, such as "x=-1.5": what lies beyond them no ray samples.
+
+        Args:
+            renderer: trained; a sampler that does not know where matter is tells of none.
+            frames: of the training.
+        """
+        known = renderer.sampler.cells_at_any_time()
+        if known is None:
+            return []
+        box, mask = (values.cpu() for values in known)
+        outer = torch.zeros_like(mask)
+        for axis in range(3):
+            outer.index_fill_(axis, torch.tensor([0, mask.shape[axis] - 1]), True)
+        seen = self._seen(frames, box, mask & outer)
+        return [
+            f"{name}={float(box[end, axis]):.4g}"
+            for axis, name in enumerate("xyz")
+            for end in (0, 1)
+            if seen.select(axis, -end).float().mean() > CUT_SHARE
+        ]
 
     def _seen(self, frames: Frames, box: Tensor, mask: Tensor) -> Tensor:
         """The cells (Gx, Gy, Gz) of a mask that enough views see; they are asked for blocks of cells."""

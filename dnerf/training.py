@@ -203,6 +203,8 @@ class Trainer:
             renderer.sampler.fix_sizes(None)
         renderer.set_progress(1.0)
         renderer.eval()
+        if self.box_check is not None and processes.is_first:
+            self.box_check.warn(renderer, frames)
         assert run.record is not None
         return TrainingRecord(**run.record)
 

@@ -204,6 +204,28 @@ def test_training_goes_on_after_the_last_check() -> None:
     assert training(BoxCheck(every=2, until=1)).fit(model, views()).step == 3
 
 
+def test_faces_that_cut_matter_are_named() -> None:
+    """The ball goes from x = -0.9 to 0.9."""
+    assert BoxCheck().cut(renderer(0.8), views()) == ["x=-0.8", "x=0.8"]
+    assert BoxCheck().cut(renderer(1.1), views()) == []
+    assert BoxCheck().cut(renderer(0.25), views()) == ["x=-0.25", "x=0.25", "y=-0.25", "y=0.25", "z=-0.25", "z=0.25"]
+
+
+def test_junk_that_few_views_see_is_not_told_of() -> None:
+    box = renderer(4.0, Balls(stray=(3.9, 0.0, 0.0)))
+    assert BoxCheck(min_views=0.4).cut(box, views()) == []
+    assert BoxCheck(min_views=0.0).cut(box, views()) == ["x=4"]
+
+
+def test_training_ends_with_a_warning_where_matter_is_cut(caplog: pytest.LogCaptureFixture) -> None:
+    training(BoxCheck(until=1)).fit(renderer(0.8), views())
+    assert "matter reaches the box at x=-0.8, x=0.8" in caplog.text
+    caplog.clear()
+    training(None).fit(renderer(0.8), views())
+    training(BoxCheck(until=1)).fit(renderer(1.1), views())
+    assert not caplog.text
+
+
 @pytest.mark.parametrize(("spent", "goes_on"), [(0.0, False), (20.0, False), (26.0, True)])
 def test_training_goes_on_when_too_little_time_is_left(spent: float, goes_on: bool) -> None:
     model = renderer(2.9)
