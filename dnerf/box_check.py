@@ -129,9 +129,15 @@ class BoxCheck:
         corners = torch.lerp(box[0], box[1], torch.stack([cells.amin(0), cells.amax(0) + 1]) / torch.tensor(mask.shape))
         return _within(box, corners, *((self.shrink_below, self.room) if of_matter else (SHRINK_AT_ONCE, 0.0)))
 
-    def warn(self, renderer: Renderer, frames: Frames) -> None:
-        """Log a warning that names the faces that `cut` finds."""
-        if faces := self.cut(renderer, frames):
+    def warn(self, step: int, renderer: Renderer, frames: Frames) -> None:
+        """Log a warning that names the faces that `cut` finds, after `until` steps: before, it may be haze.
+
+        Args:
+            step: steps done.
+            renderer: trained.
+            frames: of the training.
+        """
+        if step >= self.until and (faces := self.cut(renderer, frames)):
             logger.warning("matter reaches the box at %s: what lies beyond is not seen, see data.box", ", ".join(faces))
 
     def cut(self, renderer: Renderer, frames: Frames) -> list[str]:

@@ -204,7 +204,7 @@ class Trainer:
         renderer.set_progress(1.0)
         renderer.eval()
         if self.box_check is not None and processes.is_first:
-            self.box_check.warn(renderer, frames)
+            self.box_check.warn(run.step, renderer, frames)
         assert run.record is not None
         return TrainingRecord(**run.record)
 
