@@ -8,12 +8,14 @@ from torch.nn.functional import max_pool3d
 
 from dnerf.checks import check_positive
 from dnerf.data.frames import Frames
+from dnerf.geometry import ray_box
 from dnerf.renderer import Renderer
 
 logger = logging.getLogger(__name__)
 
 SHRINK_AT_ONCE = 0.9  # of the box's longest side: beginning anew before the first step costs nothing
 CUT_SHARE = 3e-3  # of a face's cells: fewer are haze
+EVERY_PIXEL = 3  # in rows and columns, of those that are asked for matter outside of a box
 BLOCK = 2  # cells of which views are asked at once: an eighth of the work
 
 
@@ -39,7 +41,8 @@ class BoxCheck:
     Grids, lattices and occupancy share out a fixed number of cells, so a box four times as long means cells four times
     as long and a blurred picture. Before the first step it is known what the cameras see, after a few hundred steps
     what is occupied. If that is much smaller than the box, all that is lost by beginning anew in a smaller one is those
-    steps. Nothing that is seen and occupied at any time lies outside the smaller one.
+    steps. Nothing that is seen and occupied at any time lies outside the smaller one, and where pictures have alpha, no
+    opaque pixel looks past it: small bodies that move fast may not have been found yet.
 
     Args:
         every: steps between checks.
@@ -127,7 +130,10 @@ class BoxCheck:
         if not len(cells):
             return None
         corners = torch.lerp(box[0], box[1], torch.stack([cells.amin(0), cells.amax(0) + 1]) / torch.tensor(mask.shape))
-        return _within(box, corners, *((self.shrink_below, self.room) if of_matter else (SHRINK_AT_ONCE, 0.0)))
+        if not of_matter:
+            return _within(box, corners, SHRINK_AT_ONCE)
+        smaller = _within(box, corners, self.shrink_below, self.room)
+        return None if smaller is None or shows_outside(frames, smaller) else smaller
 
     def warn(self, step: int, renderer: Renderer, frames: Frames) -> None:
         """Log a warning that names the faces that `cut` finds, after `until` steps: before, it may be haze.
@@ -138,7 +144,9 @@ class BoxCheck:
             frames: of the training.
         """
         if step >= self.until and (faces := self.cut(renderer, frames)):
-            logger.warning("matter reaches the box at %s: what lies beyond is not seen, see data.box", ", ".join(faces))
+            logger.warning(
+                "matter reaches the box at %s: what lies beyond is never sampled, see data.box", ", ".join(faces)
+            )
 
     def cut(self, renderer: Renderer, frames: Frames) -> list[str]:
         """Faces of the box at which matter ends, such as "x=-1.5": what lies beyond them no ray samples.
@@ -151,10 +159,9 @@ class BoxCheck:
         if known is None:
             return []
         box, mask = (values.cpu() for values in known)
-        outer = torch.zeros_like(mask)
-        for axis in range(3):
-            outer.index_fill_(axis, torch.tensor([0, mask.shape[axis] - 1]), True)
-        seen = self._seen(frames, box, mask & outer)
+        outer = mask.clone()
+        outer[1:-1, 1:-1, 1:-1] = False
+        seen = self._seen(frames, box, outer)
         return [
             f"{name}={float(box[end, axis]):.4g}"
             for axis, name in enumerate("xyz")
@@ -192,6 +199,23 @@ def reach(frames: Frames) -> Tensor:
         ends += [rays.origins + distances[:, None] * rays.directions for distances in (rays.near, rays.far)]
     places = torch.cat(ends)
     return torch.stack([places.amin(0), places.amax(0)])
+
+
+def shows_outside(frames: Frames, box: Tensor) -> bool:
+    """Whether an opaque pixel looks past a box (2, 3), so that matter lies outside; pictures without alpha do not tell.
+
+    One of `EVERY_PIXEL` squared pixels of each view is asked.
+    """
+    if not frames.has_alpha:
+        return False
+    box = box.to(frames.poses.device)
+    for index in range(len(frames)):
+        rows, columns = (frames.images[index, ::EVERY_PIXEL, ::EVERY_PIXEL, 3] >= 128).nonzero().unbind(-1)
+        rays = frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * frames.intrinsics.width + columns))
+        enter, leave = ray_box(rays.origins, rays.directions, box)
+        if bool((enter > leave).any()):
+            return True
+    return False
 
 
 def share_of_views(frames: Frames, positions: Tensor, most: int = 32) -> Tensor:

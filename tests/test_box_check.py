@@ -1,6 +1,7 @@
 """Boxes that are far too large are noticed, and nothing that is seen and occupied is left out of the smaller one."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dnerf.backgrounds import ConstantBackground
-from dnerf.box_check import BoxCheck, BoxTooLarge, reach, share_of_views
+from dnerf.box_check import BoxCheck, BoxTooLarge, reach, share_of_views, shows_outside
 from dnerf.cameras import Camera, Intrinsics, look_at, orbit_path
 from dnerf.compositing import FieldOutput
 from dnerf.data.frames import Frames
@@ -202,6 +203,27 @@ def test_training_goes_on_after_the_last_check() -> None:
     model.sampler.occupy(torch.ones(1, 1, 1, 1, dtype=torch.bool))
     model.sampler.update_every = 2
     assert training(BoxCheck(every=2, until=1)).fit(model, views()).step == 3
+
+
+def with_opaque(index: int, row: int, column: int) -> Frames:
+    """The views with alpha, all of it clear but for one pixel."""
+    images = torch.zeros(12, 8, 8, 4, dtype=torch.uint8)
+    images[index, row, column, 3] = 255
+    return replace(views(), images=images)
+
+
+def test_no_box_leaves_out_what_an_opaque_pixel_shows() -> None:
+    """A body that the field has not found yet is seen all the same."""
+    assert BoxCheck().smaller(renderer(4.0), with_opaque(7, 3, 3), of_matter=True) is not None
+    assert BoxCheck().smaller(renderer(4.0), with_opaque(7, 0, 6), of_matter=True) is None
+    assert BoxCheck().smaller(renderer(4.0), with_opaque(0, 6, 0), of_matter=True) is None
+
+
+def test_an_opaque_pixel_looks_past_a_box_or_into_it() -> None:
+    cube = torch.tensor([[-0.5] * 3, [0.5] * 3])
+    assert not shows_outside(with_opaque(2, 3, 3), cube)
+    assert shows_outside(with_opaque(2, 3, 3), cube + 3)
+    assert not shows_outside(views(), cube + 3)  # no alpha
 
 
 def test_faces_that_cut_matter_are_named() -> None:
