@@ -10,7 +10,8 @@ class TimeWindow:
     """Training begins with the frames nearest in time to an origin; the others come in as it goes on.
 
     A field that sees all times at once first learns their blur, and may explain motion by matter that comes and goes.
-    Near the origin little has moved; what comes in later lies close to where the deformation already leads.
+    Near the origin little has moved; what comes in later lies close to where the deformation already leads. The trainer
+    holds its learning rates until all frames are in: the last ones have as far to go as the first.
     Source: D-NeRF's code (`precrop_iters_time`), there from time 0.
 
     Args:
@@ -37,6 +38,10 @@ class TimeWindow:
         """How many of `count` frames are in at a progress in [0, 1]."""
         share = self.start + (1 - self.start) * min(progress / self.end, 1.0)
         return min(max(round(share * count), 1), count)
+
+    def since_open(self, progress: float) -> float:
+        """How much of the training that sees all frames is over, in [0, 1]; 0 before, and throughout if `end` is 1."""
+        return max(progress - self.end, 0.0) / (1 - self.end) if self.end < 1 else 0.0
 
     def draw(
         self, times: Tensor, num_pixels: int, count: int, progress: float, *, generator: torch.Generator

@@ -61,7 +61,8 @@ class Trainer:
         losses: terms by name; the photometric loss if None.
         loss_every: by name of a term, n: it is asked on every n-th step and counts n times there, which costs less and
             means the same on average; names that are none are ignored, others take part in every step.
-        time_window: lets frames in by time as training goes on; None for all from the start.
+        time_window: lets frames in by time as training goes on, and holds learning rates until all are in; None for
+            all from the start.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
@@ -299,7 +300,8 @@ class Trainer:
         """One optimiser step on this process's share of a random batch."""
         progress, frames = self._progress(run), steps.frames
         renderer.set_progress(progress)
-        factor = rate_factor(self.schedule, self.final_learning_rate, self.warmup_steps, progress, run.step)
+        cooling = progress if self.time_window is None else self.time_window.since_open(progress)
+        factor = rate_factor(self.schedule, self.final_learning_rate, self.warmup_steps, cooling, run.step)
         run.optimizer.set_rates(factor * (1.0 if self.recovery is None else self.recovery.factor))
         processes.merge_observations(renderer, run.step)
         steps.update(run.step)

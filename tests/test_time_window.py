@@ -37,6 +37,13 @@ def test_an_open_window_changes_nothing() -> None:
     assert torch.equal(drawn, torch.randint(3 * SIZE, (50,), generator=torch.Generator().manual_seed(0)))
 
 
+def test_what_is_over_counts_from_when_all_frames_are_in() -> None:
+    window = TimeWindow(end=0.6)
+    assert [window.since_open(progress) for progress in (0.0, 0.6, 1.0)] == [0.0, 0.0, 1.0]
+    assert window.since_open(0.8) == pytest.approx(0.5)
+    assert TimeWindow(end=1.0).since_open(1.0) == 0.0
+
+
 def test_one_frame_is_always_in() -> None:
     assert TimeWindow(start=0.01).num_frames(3, 0.0) == 1
     assert TimeWindow(start=0.01).num_frames(3, 1.0) == 3

@@ -63,6 +63,21 @@ def test_a_time_window_begins_with_few_frames(frames):
     assert nums_frames[0] < nums_frames[10] == nums_frames[-1] == len(frames)
 
 
+def test_rates_are_held_until_all_frames_are_in(frames):
+    def factors(**settings):
+        found = []
+        trainer(num_steps=20, log_every=1, final_learning_rate=0.1, **settings).fit(
+            small_renderer(), frames, callbacks=[lambda record, _: found.append(record.learning_rate_factor)]
+        )
+        return found
+
+    held = factors(time_window=TimeWindow(0.5, end=0.5))
+    assert held[:11] == [1.0] * 11
+    # The other ten steps go through what a training of ten steps goes through, one step late.
+    assert held[11:] == pytest.approx([0.1 ** (step / 10) for step in range(1, 10)])
+    assert factors(time_window=TimeWindow(end=1.0)) == [1.0] * 20
+
+
 def test_same_seed_gives_the_same_weights(frames):
     one, two, other = small_renderer(), small_renderer(), small_renderer()
     trainer().fit(one, frames, seed=3)

@@ -42,10 +42,11 @@ def endpoint_rows(
 
     Returns:
         Rows of time, num_points, moved (mean distance that matter moves, the error of a model in which nothing does),
-        mean_error, median_error and residual (median, see `carry`), in world units.
+        mean_error, median_error and residual (median, see `carry`), in world units. Times at which no point is in one
+        body only are left out.
 
     Raises:
-        ValueError: if nothing moves.
+        ValueError: if nothing moves, or at no time is a point in one body only.
     """
     start = surface_points(scene, time, num_points, depth=depth, seed=seed)
     farthest = torch.stack([(scene.advect(start, time, end) - start).norm(dim=-1) for end in times]).amax(0)
@@ -57,6 +58,8 @@ def endpoint_rows(
         truth = scene.advect(start, time, end)
         moments = torch.full_like(truth[:, 0], end)
         alone = scene.contains(truth, moments).sum(-1) == 1
+        if not alone.any():
+            continue
         points, target = start[alone], truth[alone]
         moved, residual = carry(model, points, time, end)
         errors = (moved - target).norm(dim=-1)
@@ -70,6 +73,8 @@ def endpoint_rows(
                 "residual": float(residual.median()),
             }
         )
+    if not rows:
+        raise ValueError(f"scene must have matter that is in one body only at one of the times {list(times)}")
     return rows
 
 

@@ -43,3 +43,10 @@ def test_a_scene_without_motion_is_named() -> None:
     scene = make_scene("static")
     with pytest.raises(ValueError, match=r"matter that moves by 0\.01"):
         endpoint_rows(scene, scene, num_points=50)
+
+
+def test_times_at_which_bodies_hide_in_each_other_are_left_out() -> None:
+    scene = make_scene("merging_balls")  # at 1/2 one ball is where the other is
+    assert [row["time"] for row in endpoint_rows(scene, scene, num_points=100, times=(0.25, 0.5, 1.0))] == [0.25, 1.0]
+    with pytest.raises(ValueError, match=r"in one body only at one of the times \[0\.5\]"):
+        endpoint_rows(scene, scene, num_points=100, times=(0.5,))
