@@ -1,9 +1,13 @@
 """Frames that come in by time: motion is found from one moment outwards, instead of everywhere at once."""
 
+from bisect import bisect_right
+
 import torch
 from torch import Tensor
 
 from dnerf.checks import check_positive
+
+SAME_TIME = 1e-6  # frames no further from the origin than others are in with them
 
 
 class TimeWindow:
@@ -17,7 +21,7 @@ class TimeWindow:
     Args:
         origin: time in [0, 1] around which the window opens.
         end: fraction of training, in (0, 1], at which all frames are in.
-        start: share of the frames that are in at first, in (0, 1]; one frame at least.
+        start: share of the frames that are in at first, in (0, 1]; one frame at least, and those of the same time.
 
     Raises:
         ValueError: for numbers out of range.
@@ -33,6 +37,7 @@ class TimeWindow:
         self.origin = origin
         self.end = end
         self.start = start
+        self._sorted: tuple[Tensor, Tensor, list[float]] | None = None  # times, their order, distances in that order
 
     def num_frames(self, count: int, progress: float) -> int:
         """How many of `count` frames are in at a progress in [0, 1]."""
@@ -60,8 +65,16 @@ class TimeWindow:
         """
         num_frames = self.num_frames(len(times), progress)
         size = num_pixels // len(times)
+        nearest = None
+        if num_frames < len(times):
+            nearest, distances = self._from_origin(times)
+            num_frames = bisect_right(distances, distances[num_frames - 1] + SAME_TIME)
         drawn = torch.randint(num_frames * size, (count,), generator=generator, device=generator.device)
-        if num_frames == len(times):
-            return drawn
-        nearest = torch.argsort((times - self.origin).abs(), stable=True)
-        return nearest[drawn // size] * size + drawn % size
+        return drawn if nearest is None else nearest[drawn // size] * size + drawn % size
+
+    def _from_origin(self, times: Tensor) -> tuple[Tensor, list[float]]:
+        """Frames from the origin outwards, and how far they are; asked once for one tensor of times."""
+        if self._sorted is None or self._sorted[0] is not times:
+            distances, order = (times - self.origin).abs().sort(stable=True)
+            self._sorted = times, order, distances.tolist()
+        return self._sorted[1:]

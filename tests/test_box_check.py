@@ -18,6 +18,7 @@ from dnerf.fields import RadianceField
 from dnerf.losses import PhotometricLoss
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, StratifiedSampler
+from dnerf.time_window import TimeWindow
 from dnerf.training import Trainer, TrainingRecord
 
 
@@ -260,6 +261,17 @@ def test_training_goes_on_when_too_little_time_is_left(spent: float, goes_on: bo
         return
     with pytest.raises(BoxTooLarge):
         trainer.fit(model, views(), seconds=spent)
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_without_alpha_the_check_waits_until_all_frames_are_in(has_alpha: bool) -> None:
+    """Frames that are not in yet may show matter elsewhere; only pictures with alpha tell before they are."""
+    model = renderer(2.9)
+    model.sampler.occupy(torch.ones(1, 1, 1, 1, dtype=torch.bool))
+    model.sampler.update_every = 2
+    trainer = training(BoxCheck(every=2), num_steps=10, time_window=TimeWindow(end=0.8))
+    with pytest.raises(BoxTooLarge, match="step 2:" if has_alpha else "step 8:"):
+        trainer.fit(model, with_opaque(7, 3, 3) if has_alpha else views())
 
 
 def test_what_cameras_reach_is_asked_for_whatever_time_is_left() -> None:

@@ -81,8 +81,15 @@ def test_the_networks_that_move_matter_take_orthogonalised_steps(experiment, slo
 
 
 def test_a_time_window_joins_any_experiment():
-    trainer = instantiate(composed("experiment=fast", "+trainer/time_window=growing").trainer, _convert_="all")
+    trainer = instantiate(composed("experiment=dnerf", "+trainer/time_window=growing").trainer, _convert_="all")
     assert trainer.time_window.num_frames(100, 0.0) == 5
+
+
+@pytest.mark.parametrize("experiment", ["fast", "flow", "fast_gpu", "flow_gpu", "demo"])
+def test_the_fast_path_lets_frames_in_by_time(experiment):
+    added = composed("experiment=dnerf", "+trainer/time_window=growing")
+    assert composed(f"experiment={experiment}").trainer.time_window == added.trainer.time_window
+    assert composed("experiment=dnerf").trainer.time_window is None
 
 
 def test_every_scene_has_a_config_that_builds_it():

@@ -37,6 +37,19 @@ def test_an_open_window_changes_nothing() -> None:
     assert torch.equal(drawn, torch.randint(3 * SIZE, (50,), generator=torch.Generator().manual_seed(0)))
 
 
+def test_frames_of_one_time_come_in_together() -> None:
+    assert seen(TimeWindow(0.5, start=0.1), [0.3] * 10, 0.0) == {0.3}
+    assert len(set((draw(TimeWindow(0.5, start=0.1), [0.3] * 10, 0.0) // SIZE).tolist())) == 10
+    both_sides = draw(TimeWindow(0.5, start=0.4), [0.0, 0.4, 0.5, 0.6, 1.0], 0.0) // SIZE
+    assert set(both_sides.tolist()) == {1, 2, 3}
+
+
+def test_a_window_serves_other_frames_too() -> None:
+    window = TimeWindow(0.0, start=0.5)
+    assert seen(window, [0.0, 1.0], 0.0) == {0.0}
+    assert seen(window, [0.9, 0.2], 0.0) == {0.2}
+
+
 def test_what_is_over_counts_from_when_all_frames_are_in() -> None:
     window = TimeWindow(end=0.6)
     assert [window.since_open(progress) for progress in (0.0, 0.6, 1.0)] == [0.0, 0.0, 1.0]
