@@ -46,7 +46,8 @@ class BoxCheck:
 
     Args:
         every: steps between checks.
-        until: last step at which one is made: haze of a large box takes its time to go.
+        until: last step at which one is made: haze of a large box takes its time to go. For pictures without alpha
+            steps count from when all frames are in.
         until_spent: share of the seconds that training may take, in [0, 1], after which none is made: what is left has
             to be worth beginning anew.
         shrink_below: longest side of what is needed, as a share of the box's, in (0, 1), below which the box is too
@@ -87,21 +88,33 @@ class BoxCheck:
         self.room = room
 
     def __call__(
-        self, step: int, seconds: float, renderer: Renderer, frames: Frames, *, max_seconds: float | None = None
+        self,
+        step: int,
+        seconds: float,
+        renderer: Renderer,
+        frames: Frames,
+        *,
+        with_all_frames: float | None,
+        max_seconds: float | None = None,
     ) -> None:
         """Check, if it is time.
+
+        While frames come in by time, matter may go elsewhere at times that are not in yet. Opaque pixels of their
+        pictures tell of it; for pictures without alpha the check waits, and counts its steps from when all are in.
 
         Args:
             step: steps done; the sampler has learnt from the field since the last one.
             seconds: of training so far.
             renderer: in training.
             frames: of the training.
+            with_all_frames: steps of them that all frames took part in, or None if some are still to come.
             max_seconds: that training may take, or None.
 
         Raises:
             BoxTooLarge: with the box that is enough.
         """
-        if step % self.every or step > self.until:
+        counted = step if frames.has_alpha or not step else with_all_frames
+        if step % self.every or counted is None or counted > self.until:
             return
         if step and max_seconds is not None and seconds > self.until_spent * max_seconds:
             return

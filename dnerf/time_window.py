@@ -48,6 +48,10 @@ class TimeWindow:
         """How much of the training that sees all frames is over, in [0, 1]; 0 before, and throughout if `end` is 1."""
         return max(progress - self.end, 0.0) / (1 - self.end) if self.end < 1 else 0.0
 
+    def steps_since_open(self, step: int, progress: float) -> float | None:
+        """About how many of `step` steps saw all frames, None before any can; steps take equal shares of progress."""
+        return None if progress < self.end else step * (1 - self.end / progress)
+
     def draw(
         self, times: Tensor, num_pixels: int, count: int, progress: float, *, generator: torch.Generator
     ) -> Tensor:

@@ -305,10 +305,9 @@ class Trainer:
         run.optimizer.set_rates(factor * (1.0 if self.recovery is None else self.recovery.factor))
         processes.merge_observations(renderer, run.step)
         steps.update(run.step)
-        is_open = self.time_window is None or progress >= self.time_window.end
-        # Matter may go elsewhere at times that are not in yet; opaque pixels of their pictures tell the check of it.
-        if self.box_check is not None and (run.step == 0 or is_open or frames.has_alpha):
-            self.box_check(run.step, run.seconds, renderer, frames, max_seconds=self.max_seconds)
+        if self.box_check is not None:
+            seen = run.step if self.time_window is None else self.time_window.steps_since_open(run.step, progress)
+            self.box_check(run.step, run.seconds, renderer, frames, max_seconds=self.max_seconds, with_all_frames=seen)
         generator, num_rays = run.generator, run.num_rays
         if self.time_window is None:
             indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)

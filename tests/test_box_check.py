@@ -274,6 +274,20 @@ def test_without_alpha_the_check_waits_until_all_frames_are_in(has_alpha: bool) 
         trainer.fit(model, with_opaque(7, 3, 3) if has_alpha else views())
 
 
+@pytest.mark.parametrize(("until", "is_found"), [(4, True), (1, False)])
+def test_without_alpha_steps_of_the_check_count_from_when_all_frames_are_in(until: int, is_found: bool) -> None:
+    """All are in from step 7.2 on, so step 9 is 1.8 steps after it, though far more than `until` from the first."""
+    model = renderer(2.9)
+    model.sampler.occupy(torch.ones(1, 1, 1, 1, dtype=torch.bool))
+    model.sampler.update_every = 2
+    trainer = training(BoxCheck(every=3, until=until), num_steps=12, time_window=TimeWindow(end=0.6))
+    if not is_found:
+        assert trainer.fit(model, views()).step == 12
+        return
+    with pytest.raises(BoxTooLarge, match="step 9:"):
+        trainer.fit(model, views())
+
+
 def test_what_cameras_reach_is_asked_for_whatever_time_is_left() -> None:
     model = renderer(20.0)
     with pytest.raises(BoxTooLarge, match="step 0"):

@@ -57,6 +57,13 @@ def test_what_is_over_counts_from_when_all_frames_are_in() -> None:
     assert TimeWindow(end=1.0).since_open(1.0) == 0.0
 
 
+def test_steps_count_from_when_all_frames_are_in() -> None:
+    window = TimeWindow(end=0.6)
+    assert window.steps_since_open(59, 0.59) is None
+    assert window.steps_since_open(60, 0.6) == 0.0
+    assert window.steps_since_open(90, 0.9) == pytest.approx(30.0)
+
+
 def test_one_frame_is_always_in() -> None:
     assert TimeWindow(start=0.01).num_frames(3, 0.0) == 1
     assert TimeWindow(start=0.01).num_frames(3, 1.0) == 3
