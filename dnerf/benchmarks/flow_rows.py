@@ -153,7 +153,7 @@ def variants() -> dict[str, Deformation]:
     return {
         "displacement (4 x 128)": DisplacementDeformation(4, 128, (), **small),
         "SE(3) (4 x 128)": SE3Deformation(4, 128, (), **small),
-        "flow, chain of 2 Euler steps of twists (3 x 128)": chain(twists=True),
+        "flow, chain of 2 Euler steps of twists (3 x 128)": chain(twists=0.3),
         "flow, chain of 2 Euler steps (3 x 128)": chain(),
         "flow, chain of 2 Euler steps (2 x 128)": chain(num_layers=2),
         "flow, frozen clock, 1 midpoint step (3 x 128)": FlowDeformation(network(), **frozen),

@@ -21,7 +21,7 @@ BOX = ((-1.0, -2.0, -1.5), (1.0, 2.0, 0.5))
 VELOCITIES: dict[str, Callable[[], Velocity]] = {
     "network": lambda: NetworkVelocity(BOX, 2, 16),
     "network, relu": lambda: NetworkVelocity(BOX, 1, 16, activation="relu", smoothness=1),
-    "network, twists": lambda: NetworkVelocity(BOX, 2, 16, twists=True),
+    "network, twists": lambda: NetworkVelocity(BOX, 2, 16, twists=0.3),
     "grid": lambda: GridVelocity(BOX, 4, 5),
     "grid and network": lambda: GridVelocity(BOX, 4, 5, hidden_features=8),
     "curl": lambda: CurlVelocity(BOX, 8, 16),
@@ -162,14 +162,14 @@ def test_one_rigid_cluster_keeps_distances() -> None:
 
 
 def test_a_twist_that_is_the_same_everywhere_turns_a_rigid_body() -> None:
-    velocity = NetworkVelocity(BOX, 2, 16, twists=True).double()
+    velocity = NetworkVelocity(BOX, 2, 16, twists=0.3).double()
     twist = torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6], dtype=torch.float64)
     with torch.no_grad():
         velocity.mlp.output.bias += twist
     positions, times = points(50)
     center = velocity.window.center
     positions = 0.5 * (positions - center) + center
-    expected = twist[:3] + torch.linalg.cross(twist[3:].expand(50, 3), positions - center)
+    expected = twist[:3] + 0.3 * torch.linalg.cross(twist[3:].expand(50, 3), positions - center)
     torch.testing.assert_close(velocity(positions, times), expected, rtol=0, atol=1e-12)
 
 
@@ -257,6 +257,7 @@ def test_smooth_step_coefficients_are_the_known_ones() -> None:
         (lambda: RigidVelocity(BOX, 0), "num_clusters must be > 0"),
         (lambda: RigidVelocity(BOX, radius=math.inf), "radius must be > 0 and finite"),
         (lambda: NetworkVelocity(BOX, 0), "num_layers must be > 0"),
+        (lambda: NetworkVelocity(BOX, twists=-1.0), "twists must be >= 0"),
         (lambda: NetworkVelocity(BOX, activation="sine"), "activation must be one of relu, silu, softplus"),
     ],
 )

@@ -14,8 +14,9 @@ from dnerf.mlp import MLP
 class NetworkVelocity(Velocity):
     """v(x, t) = w(x) MLP(x, t), w the window of the box; zero everywhere at initialisation.
 
-    With `twists` the MLP gives a travelling u and a turning omega, v = w (u + omega x (x - c)), c the box's centre:
-    what turns as a rigid body has the same u and omega everywhere, which is less to learn than v.
+    With `twists` the MLP gives a travelling u and a turning omega, v = w (u + k omega x (x - c)), c the box's centre:
+    what turns as a rigid body has the same u and omega everywhere, which is less to learn than v. The factor k says how
+    readily the field turns: steps of an optimiser move u and omega alike.
 
     Where a solver looks several times at the same times (`at`), those are encoded once.
 
@@ -29,7 +30,7 @@ class NetworkVelocity(Velocity):
         margin: see `BoxWindow`.
         smoothness: see `BoxWindow`.
         window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
-        twists: see above.
+        twists: k in radians per unit of the MLP's output; 0 for a field that gives v itself.
 
     Raises:
         ValueError: for numbers out of range.
@@ -47,11 +48,12 @@ class NetworkVelocity(Velocity):
         margin: float = 0.1,
         smoothness: int = 4,
         window_end: float | None = None,
-        twists: bool = False,
+        twists: float = 0.0,
     ) -> None:
         super().__init__()
         check_positive("num_layers", num_layers)
-        self.twists = twists
+        check_positive("twists", twists, allow_zero=True)
+        self.twists = float(twists)
         self.window = BoxWindow(box, margin, smoothness)
         self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
         self.encode_times = SinusoidalEncoding(1, time_frequencies)
@@ -79,7 +81,7 @@ class NetworkVelocity(Velocity):
             if self.twists:
                 travelling, turning = motion.split(3, dim=-1)
                 arms = inside - self.window.center.to(positions.dtype)
-                motion = travelling + torch.linalg.cross(turning, arms)
+                motion = torch.add(travelling, torch.linalg.cross(turning, arms), alpha=self.twists)
             return self.window(positions) * motion
 
         return velocity
