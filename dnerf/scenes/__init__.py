@@ -6,13 +6,14 @@ from dnerf.checks import check_choice
 from dnerf.scenes.base import AnalyticScene
 from dnerf.scenes.bending_rod import make_bending_rod
 from dnerf.scenes.bodies import Body
+from dnerf.scenes.bouncing_balls import make_bouncing_balls
 from dnerf.scenes.dense_fog import make_dense_fog
 from dnerf.scenes.exact_motion import ExactFlow, ExactTracks, exact_flow, exact_tracks, first_surfaces, is_visible
 from dnerf.scenes.fast_ball import make_fast_ball
 from dnerf.scenes.glossy_ball import make_glossy_ball
 from dnerf.scenes.jumping_ball import make_jumping_ball
 from dnerf.scenes.merging_balls import make_merging_balls
-from dnerf.scenes.motions import Fixed, Joint, Jump, Motion, Orbit, Pulse, Slide, Spin, Vanish, Wave
+from dnerf.scenes.motions import Bounce, Fixed, Joint, Jump, Motion, Orbit, Pulse, Slide, Spin, Vanish, Wave
 from dnerf.scenes.opaque_wall import make_opaque_wall
 from dnerf.scenes.orbiting_balls import make_orbiting_balls
 from dnerf.scenes.poses import Pose
@@ -40,6 +41,7 @@ from dnerf.scenes.warps import Bend, Twist, Warp
 
 SCENES: dict[str, Callable[[], AnalyticScene]] = {
     "bending_rod": make_bending_rod,
+    "bouncing_balls": make_bouncing_balls,
     "dense_fog": make_dense_fog,
     "fast_ball": make_fast_ball,
     "glossy_ball": make_glossy_ball,
@@ -73,6 +75,7 @@ __all__ = [
     "Ball",
     "Bend",
     "Body",
+    "Bounce",
     "Box",
     "Capsule",
     "Checker",
@@ -106,6 +109,7 @@ __all__ = [
     "grid_planes",
     "is_visible",
     "make_bending_rod",
+    "make_bouncing_balls",
     "make_dense_fog",
     "make_fast_ball",
     "make_glossy_ball",

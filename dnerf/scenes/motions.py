@@ -41,6 +41,28 @@ class Wave:
         return value
 
 
+@dataclass(frozen=True)
+class Bounce:
+    """Height above the ground of what falls and bounces without loss: parabolas, `4 height s (1 - s)`, s from 0 to 1.
+
+    With a whole number of bounces it is the same at t = 1 as at t = 0. The velocity jumps where the ground is met.
+
+    Args:
+        height: of the apex, in world units.
+        bounces: arcs while t goes from 0 to 1.
+        phase: share of an arc that is over at t = 0.
+    """
+
+    height: float
+    bounces: float = 1.0
+    phase: float = 0.0
+
+    def __call__(self, times: Tensor) -> Tensor:
+        """Height (...,) at times (...,)."""
+        arc = torch.remainder(self.bounces * times + self.phase, 1.0)
+        return 4 * self.height * arc * (1 - arc)
+
+
 class Motion(ABC):
     """Where a body's frame is at each time, relative to a parent's frame or to the world."""
 
@@ -171,7 +193,7 @@ class Slide(Motion):
 
     parent: Motion | None = None
     axis: Vector = (0.0, 0.0, 1.0)
-    distance: Wave = field(default_factory=Wave)
+    distance: Wave | Bounce = field(default_factory=Wave)
 
     def relative(self, times: Tensor) -> Pose:
         """The shift."""

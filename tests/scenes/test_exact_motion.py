@@ -204,12 +204,12 @@ def test_motion_there_and_back_is_none() -> None:
 def test_tracks_are_the_vectors_of_every_time(name: str) -> None:
     scene = make_scene(name)
     times = [T0, T1, 0.9]
-    pixels = torch.tensor([[20.0, 15.0], [18.0, 17.0], [22.0, 13.0], [0.0, 0.0]])
+    pixels = torch.tensor([[20.0, 15.0], [18.0, 17.0], [22.0, 13.0], [20.0, 22.0], [0.0, 0.0]])
     tracks = exact_tracks(scene, [FIRST, SECOND, FIRST], times, pixels)
     for index, (camera, time) in enumerate(zip([FIRST, SECOND, FIRST], times)):
         flow = exact_flow(scene, FIRST, T0, camera, time)
         chosen = [(int(row), int(column)) for column, row in pixels.tolist() if flow.owners[int(row), int(column)] >= 0]
-        assert 0 < len(chosen) == tracks.positions.shape[1] < 4
+        assert 0 < len(chosen) == tracks.positions.shape[1] < len(pixels)
         for k, (row, column) in enumerate(chosen):
             there = flow.vectors[row, column] + torch.tensor([column, row])
             torch.testing.assert_close(tracks.pixels[index, k], there, rtol=0, atol=1e-9)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dnerf.geometry import so3_exp
-from dnerf.scenes import Fixed, Joint, Motion, Orbit, Pulse, Slide, Spin, Wave
+from dnerf.scenes import Bounce, Fixed, Joint, Motion, Orbit, Pulse, Slide, Spin, Wave
 from dnerf.scenes.poses import Pose, turn
 
 CHAIN = Joint(
@@ -21,6 +21,7 @@ MOTIONS: list[Motion] = [
     Orbit(0.7, -1.0, 0.3, 0.4, (0.1, 0.0, -0.1)),
     Spin(Fixed((0.5, 0.0, 0.0)), (0.0, 0.0, 1.0), 2.0),
     Slide(distance=Wave(0.1, ((0.2, 1.0, 0.0),))),
+    Slide(distance=Bounce(0.4, 3.0, 0.8)),
     Pulse(Fixed((0.0, 0.3, 0.0)), Wave(1.0, ((0.3, 1.0, 0.25),))),
     CHAIN,
 ]
@@ -55,6 +56,19 @@ def test_whole_cycles_close(motion: Motion) -> None:
     points = torch.randn(5, 3, dtype=torch.float64)
     start, end = (motion.pose(torch.full((5,), t, dtype=torch.float64)).to_world(points) for t in (0.0, 1.0))
     torch.testing.assert_close(start, end, rtol=0, atol=1e-14)
+
+
+def test_what_bounces_falls_freely_and_turns_round_on_the_ground() -> None:
+    bounce = Bounce(0.9, 2.0, 0.5)
+    marks = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0], dtype=torch.float64)
+    expected = torch.tensor([0.9, 0.0, 0.9, 0.0, 0.9], dtype=torch.float64)
+    torch.testing.assert_close(bounce(marks), expected, rtol=0, atol=1e-15)
+    times = torch.linspace(0.0, 0.2, 5, dtype=torch.float64)
+    before, here, after = (bounce(times + shift) for shift in (0.0, 0.02, 0.04))
+    gravity = -8 * 0.9 * 2**2  # the second derivative of 4 h s (1 - s) with s = 2 t + 1/2
+    torch.testing.assert_close((before - 2 * here + after) / 0.02**2, torch.full_like(times, gravity))
+    down, up = bounce(marks[1] - 1e-6), bounce(marks[1] + 1e-6)
+    torch.testing.assert_close(down, up)
 
 
 def test_turn_is_the_exponential_of_its_axis() -> None:
