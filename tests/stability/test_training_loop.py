@@ -136,7 +136,7 @@ def test_bfloat16_autocast_trains_like_float32(frames):
         "jumping_ball",
         "twisting_block",
         "bouncing_balls",
-    ],  # fmt: skip
+    ],
 )
 def test_hard_scenes_are_trained_on_without_failure(name):
     renderer, made = small_renderer("bfloat16", occupancy=True), trainer(num_steps=20)
