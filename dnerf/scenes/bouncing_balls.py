@@ -22,7 +22,7 @@ GROUND = -0.82
 
 
 def make_bouncing_balls(density: float = 80.0) -> AnalyticScene:
-    """Three balls that bounce on a plate, in a period of their own; t = 1 is t = 0 again.
+    """Three balls that bounce on a plate out of step, all under one gravity; t = 1 is t = 0 again.
 
     Args:
         density: of all bodies, in 1 / world unit.
