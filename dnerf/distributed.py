@@ -80,6 +80,16 @@ class Processes:
         seen = torch.stack(rows)
         return float(seen[0, 0]), int(seen[:, 1].sum()), int(seen[:, 2].max())
 
+    def all_rays(self, values: Tensor, num_rays: int) -> Tensor:
+        """Numbers (num_rays,) of all rays of a batch, of those of this process's share."""
+        if self.size == 1:
+            return values
+        padded = nn.functional.pad(values, (0, -(-num_rays // self.size) - len(values)))
+        rows = [torch.empty_like(padded) for _ in range(self.size)]
+        dist.all_gather(rows, padded)
+        shares = (Processes(rank, self.size).share(num_rays) for rank in range(self.size))
+        return torch.cat([row[: share.stop - share.start] for row, share in zip(rows, shares, strict=True)])
+
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
         """Each number's mean over the processes."""
         if self.size == 1:

@@ -22,7 +22,7 @@ class TrainingRecord:
         step: number of steps done, this one included.
         seconds: time spent training so far, callbacks and data loading left out.
         losses: each loss term of the step by name; "loss" is what it minimised, see `Trainer`'s `loss_every`.
-        psnr: of the batch's colours, in dB.
+        psnr: of the batch's colours, in dB; with an error map of rays that are harder than others.
         num_rays: rays of the batch.
         num_samples: field evaluations of the batch.
         learning_rate_factor: of the schedule, in [0, 1].

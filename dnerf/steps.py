@@ -16,6 +16,7 @@ LOOK_EVERY = 16  # steps between looks at how full fixed places are: each waits 
 FULL = (0.8, 0.97)  # shares of fixed places that are left alone: another number of rays is another graph
 AIM = 0.9
 UPDATE = "update"
+ERRORS = "errors of the pixels"
 ROUND_TO = 256  # rays, where places are fixed
 
 
@@ -63,7 +64,7 @@ class Steps:
 
     def __call__(
         self, indices: Tensor, number: int, weight: float, randomness: Callable[[], AbstractContextManager[None]]
-    ) -> tuple[Mapping[str, Tensor], int]:
+    ) -> tuple[dict[str, Tensor], Tensor, int]:
         """Learn from some pixels.
 
         Args:
@@ -73,9 +74,9 @@ class Steps:
             randomness: what random draws are made in.
 
         Returns:
-            Scalars on the device: the terms whose turn it is, "loss", "mse" and what recovery looks at; they hold until
-            the next step. And the number of samples; of a fixed number of places, how many were wanted when that was
-            last looked at.
+            Scalars on the device: the terms whose turn it is, "loss", "mse" and what recovery looks at; and the squared
+            errors (R,) of the pixels; they hold until the next step. And the number of samples; of a fixed number of
+            places, how many were wanted when that was last looked at.
         """
         turns = [name for name in self.losses if number % self.loss_every.get(name, 1) == 0]
 
@@ -84,13 +85,14 @@ class Steps:
                 return self._optimize(indices, turns, weight)
 
         if self.graphs is None:
-            scalars: Mapping[str, Tensor] = work(indices)
+            found: Mapping[str, Tensor] = work(indices)
         else:
             state = (len(indices), weight, self.renderer.sampler.settings)
-            scalars = self.graphs.run(tuple(turns), state, work, indices)
+            found = self.graphs.run(tuple(turns), state, work, indices)
         if self.fixed is not None and number % LOOK_EVERY == 0:
             self._num_samples = int(self.renderer.sampler.fullness() * self.fixed)
-        return scalars, self._num_samples
+        scalars = dict(found)
+        return scalars, scalars.pop(ERRORS), self._num_samples
 
     def update(self, step: int) -> None:
         """Let the sampler learn from the field, between steps; `step` counts those done."""
@@ -126,9 +128,10 @@ class Steps:
         if total.requires_grad:
             (total * weight if weight != 1 else total).backward()
             self.optimizer.step()
-        mse = (rendering.rgb.detach() - target).square().mean()
+        errors = (rendering.rgb.detach() - target).square().mean(-1)
         shown = what_is_shown(rendering, target) if self.shows else {}
-        return {name: term.detach() for name, term in {"loss": total, **terms, "mse": mse, **shown}.items()}
+        found = {"loss": total, **terms, "mse": errors.mean(), **shown, ERRORS: errors}
+        return {name: values.detach() for name, values in found.items()}
 
 
 def warm_up(renderer: Renderer, frames: Frames) -> None:

@@ -67,14 +67,19 @@ class TimeWindow:
         Returns:
             (count,) int64 in [0, num_pixels). Once all frames are in, what `torch.randint` gives.
         """
-        num_frames = self.num_frames(len(times), progress)
+        frames = self.frames_in(times, progress)
         size = num_pixels // len(times)
-        nearest = None
-        if num_frames < len(times):
-            nearest, distances = self._from_origin(times)
-            num_frames = bisect_right(distances, distances[num_frames - 1] + SAME_TIME)
+        num_frames = len(times) if frames is None else len(frames)
         drawn = torch.randint(num_frames * size, (count,), generator=generator, device=generator.device)
-        return drawn if nearest is None else nearest[drawn // size] * size + drawn % size
+        return drawn if frames is None else frames[drawn // size] * size + drawn % size
+
+    def frames_in(self, times: Tensor, progress: float) -> Tensor | None:
+        """Numbers (n,) of the frames that are in, of times (F,); None once all are."""
+        num_frames = self.num_frames(len(times), progress)
+        if num_frames == len(times):
+            return None
+        nearest, distances = self._from_origin(times)
+        return nearest[: bisect_right(distances, distances[num_frames - 1] + SAME_TIME)]
 
     def _from_origin(self, times: Tensor) -> tuple[Tensor, list[float]]:
         """Frames from the origin outwards, and how far they are; asked once for one tensor of times."""

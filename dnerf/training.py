@@ -15,6 +15,7 @@ from dnerf.box_check import BoxCheck
 from dnerf.checks import check_choice, check_mapping, check_positive
 from dnerf.data.frames import Frames
 from dnerf.distributed import Processes
+from dnerf.error_map import ErrorMap, draw_pixels
 from dnerf.graphs import GraphCache
 from dnerf.losses import Loss, PhotometricLoss
 from dnerf.optimizers import SCHEDULES, AdamMuon, rate_factor
@@ -63,6 +64,7 @@ class Trainer:
             means the same on average; names that are none are ignored, others take part in every step.
         time_window: lets frames in by time as training goes on, and holds learning rates until all are in; None for
             all from the start.
+        error_map: draws a share of the rays where pictures are wrong; None draws all evenly.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
@@ -93,6 +95,7 @@ class Trainer:
         losses: Mapping[str, Loss] | None = None,
         loss_every: Mapping[str, int] | None = None,
         time_window: TimeWindow | None = None,
+        error_map: ErrorMap | None = None,
         log_every: int = 20,
         checkpoint_every: int | None = 1000,
         progress_bar: bool = True,
@@ -134,6 +137,7 @@ class Trainer:
         self.losses = nn.ModuleDict({"rgb": PhotometricLoss()} if losses is None else dict(losses))
         self.loss_every = dict(loss_every or {})
         self.time_window = time_window
+        self.error_map = error_map
         self.log_every = log_every
         self.checkpoint_every = checkpoint_every
         self.progress_bar = progress_bar
@@ -182,7 +186,10 @@ class Trainer:
         processes = processes or Processes()
         frames = frames.to(renderer.device)
         generator = torch.Generator(renderer.device).manual_seed(seed)
-        modules = {"renderer": renderer, "losses": self.losses}
+        modules: dict[str, nn.Module] = {"renderer": renderer, "losses": self.losses}
+        if self.error_map is not None:
+            self.error_map.begin(frames)
+            modules["error_map"] = self.error_map
         run = RunState(modules, self.optimizer(renderer), generator, max(self.num_rays, processes.size))
         run.seconds = run.begun = float(seconds)
         if checkpoints is not None:
@@ -309,16 +316,15 @@ class Trainer:
             seen = run.step if self.time_window is None else self.time_window.steps_since_open(run.step, progress)
             self.box_check(run.step, run.seconds, renderer, frames, max_seconds=self.max_seconds, with_all_frames=seen)
         generator, num_rays = run.generator, run.num_rays
-        if self.time_window is None:
-            indices = torch.randint(frames.num_pixels, (num_rays,), generator=generator, device=generator.device)
-        else:
-            indices = self.time_window.draw(frames.times, frames.num_pixels, num_rays, progress, generator=generator)
-        indices = indices[processes.share(num_rays)]
+        drawn = draw_pixels(frames, num_rays, progress, self.time_window, self.error_map, generator=generator)
+        indices = drawn[processes.share(num_rays)]
         # Shares may differ by a ray: weighted so, their mean is that over all rays.
         weight = len(indices) * processes.size / num_rays
-        scalars, num_samples = steps(
+        scalars, errors, num_samples = steps(
             indices, run.step + 1, weight, lambda: processes.same_randomness(generator, num_rays)
         )
+        if self.error_map is not None:
+            self.error_map.learn(drawn, processes.all_rays(errors, num_rays))
         return Outcome(scalars, weight, num_samples, factor)
 
     def _restore(self, run: RunState, checkpoints: CheckpointFolder, processes: Processes) -> None:

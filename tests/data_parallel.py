@@ -26,6 +26,7 @@ from dnerf.compositing import Rendering
 from dnerf.data import SyntheticData
 from dnerf.deformations import DisplacementDeformation
 from dnerf.distributed import LostProcess, Processes, started
+from dnerf.error_map import ErrorMap
 from dnerf.fields import DeformedField, GridField, NeRFField
 from dnerf.losses import Loss, PhotometricLoss
 from dnerf.renderer import Renderer
@@ -49,11 +50,11 @@ def mlp() -> tuple[Renderer, dict[str, Any]]:
 
 
 def grid() -> tuple[Renderer, dict[str, Any]]:
-    """The fast path: rays adapted to samples, occupancy that learns from what each process sees."""
+    """The fast path: rays adapted to samples; occupancy and errors that are known from what each process sees."""
     canonical = GridField(BOX, (8, 16, 32), 4, hidden_features=16)
     sampler = OccupancySampler(BOX, 0.1, 24, num_slabs=4, update_every=4, num_probes=512, pad_to=1)
     return Renderer(DeformedField(deformation(), canonical), sampler, RandomBackground()), {
-        "num_rays": 64, "target_samples": 1500,
+        "num_rays": 64, "target_samples": 1500, "error_map": ErrorMap(resolution=8),
     }  # fmt: skip
 
 

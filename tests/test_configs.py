@@ -9,6 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from dnerf.data import SyntheticData
+from dnerf.error_map import ErrorMap
 from dnerf.scenes import make_scene
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -90,6 +91,14 @@ def test_the_fast_path_lets_frames_in_by_time(experiment):
     added = composed("experiment=dnerf", "+trainer/time_window=growing")
     assert composed(f"experiment={experiment}").trainer.time_window == added.trainer.time_window
     assert composed("experiment=dnerf").trainer.time_window is None
+
+
+@pytest.mark.parametrize("experiment", ["fast", "flow", "fast_gpu", "flow_gpu", "demo"])
+def test_the_fast_path_draws_rays_where_pictures_are_wrong(experiment):
+    added = composed("experiment=dnerf", "+trainer/error_map=guided")
+    assert composed(f"experiment={experiment}").trainer.error_map == added.trainer.error_map
+    assert isinstance(instantiate(added.trainer, _convert_="all").error_map, ErrorMap)
+    assert composed("experiment=dnerf").trainer.error_map is None
 
 
 def test_every_scene_has_a_config_that_builds_it():

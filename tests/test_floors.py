@@ -51,6 +51,7 @@ FLOORS = {
     "checkpoints": 7,
     "consistency": 7,
     "distributed": 7,
+    "error_map": 7,
     "evaluation": 7,
     "logs": 7,
     "report": 7,
@@ -88,6 +89,7 @@ WITHIN_A_FLOOR = {
     ("run_state", "checkpoints"),
     ("training", "box_check"),
     ("training", "distributed"),
+    ("training", "error_map"),
     ("training", "run_state"),
     ("training", "steps"),
 }

@@ -13,6 +13,7 @@ from dnerf.backgrounds import RandomBackground
 from dnerf.checkpoints import decode, encode
 from dnerf.data import SyntheticData
 from dnerf.deformations import DisplacementDeformation
+from dnerf.error_map import ErrorMap
 from dnerf.fields import DeformedField, GridField
 from dnerf.records import TrainingRecord
 from dnerf.renderer import Renderer
@@ -111,9 +112,13 @@ def test_a_state_has_all_that_training_changes() -> None:
 
 
 @pytest.mark.parametrize("stop", [1, 4, 7, 9])
-def test_training_in_two_parts_is_training_in_one(frames, tmp_path: Path, stop: int) -> None:
+@pytest.mark.parametrize("guided", [False, True])
+def test_training_in_two_parts_is_training_in_one(frames, tmp_path: Path, stop: int, guided: bool) -> None:
+    def begun(**changes: Any) -> Trainer:
+        return trainer(error_map=ErrorMap(share=0.5, resolution=4) if guided else None, **changes)
+
     whole, parts = small_renderer(), small_renderer()
-    expected = trainer().fit(whole, frames, seed=2, checkpoints=CheckpointFolder(tmp_path / "whole"))
+    expected = begun().fit(whole, frames, seed=2, checkpoints=CheckpointFolder(tmp_path / "whole"))
 
     class Stop(Exception):
         pass
@@ -124,10 +129,10 @@ def test_training_in_two_parts_is_training_in_one(frames, tmp_path: Path, stop: 
 
     folder = tmp_path / "parts"
     with pytest.raises(Stop):
-        trainer(log_every=1).fit(parts, frames, seed=2, callbacks=[stop_at], checkpoints=CheckpointFolder(folder))
+        begun(log_every=1).fit(parts, frames, seed=2, callbacks=[stop_at], checkpoints=CheckpointFolder(folder))
     torch.rand(5)  # the process has gone on to other things
     again = small_renderer(seed=8)
-    record = trainer().fit(again, frames, seed=3, checkpoints=CheckpointFolder(folder), resume=True)
+    record = begun().fit(again, frames, seed=3, checkpoints=CheckpointFolder(folder), resume=True)
     if stop > 4:
         for name, value in whole.state_dict().items():
             assert torch.equal(value, again.state_dict()[name]), name

@@ -27,6 +27,15 @@ def test_the_window_opens_from_the_origin_outwards() -> None:
     assert seen(window, times, 0.5) == {0.5, 0.3, 0.1, 0.7, 0.9}
 
 
+def test_the_window_says_which_frames_are_in() -> None:
+    times = torch.tensor([0.9, 0.1, 0.5, 0.3, 0.7])
+    window = TimeWindow(0.4, end=0.5, start=0.4)
+    chosen = window.frames_in(times, 0.0)
+    assert chosen is not None
+    assert sorted(chosen.tolist()) == [2, 3]
+    assert window.frames_in(times, 0.5) is None
+
+
 def test_every_pixel_of_the_frames_that_are_in_is_drawn() -> None:
     indices = draw(TimeWindow(1.0, start=0.5), [0.0, 1.0], 0.0)
     assert sorted(set(indices.tolist())) == list(range(6, 12))

@@ -7,6 +7,7 @@ import torch
 from dnerf.backgrounds import ConstantBackground, RandomBackground
 from dnerf.data import SyntheticData
 from dnerf.deformations import DisplacementDeformation
+from dnerf.error_map import UNSEEN, ErrorMap
 from dnerf.fields import DeformedField, NeRFField
 from dnerf.losses import OpacityEntropyLoss, PhotometricLoss
 from dnerf.optimizers import rate_factor
@@ -76,6 +77,34 @@ def test_rates_are_held_until_all_frames_are_in(frames):
     # The other ten steps go through what a training of ten steps goes through, one step late.
     assert held[11:] == pytest.approx([0.1 ** (step / 10) for step in range(1, 10)])
     assert factors(time_window=TimeWindow(end=1.0)) == [1.0] * 20
+
+
+def test_rays_are_drawn_where_pictures_are_wrong(frames):
+    class Watched(ErrorMap):
+        def learn(self, indices, errors):
+            drawn.append((self.errors.clone(), indices))
+            super().learn(indices, errors)
+
+    drawn: list[tuple[torch.Tensor, torch.Tensor]] = []
+    error_map = Watched(share=0.5, resolution=8)
+    window = TimeWindow(0.5, end=0.5, start=0.1)
+    trainer(num_steps=40, num_rays=512, error_map=error_map, time_window=window).fit(small_renderer(), frames)
+    size = frames.num_pixels // len(frames)
+    few = len(window.frames_in(frames.times, 0.0))
+    assert len(set((drawn[0][1] // size).tolist())) <= few < len(frames)
+    known, indices = drawn[-1]
+    rows, columns = indices % size // 24 // 3, indices % 24 // 3
+    wrong = known[indices // size, rows, columns]
+    assert float(wrong[256:].mean()) > 2 * float(wrong[:256].mean())  # guided rays beside even ones
+    assert bool((error_map.errors < UNSEEN).all())
+
+
+def test_training_begins_with_a_map_that_knows_nothing(frames):
+    made = trainer(num_steps=3, error_map=ErrorMap(resolution=8))
+    one, two = small_renderer(), small_renderer()
+    made.fit(one, frames)
+    made.fit(two, frames)
+    assert torch.equal(weights(one), weights(two))
 
 
 def test_same_seed_gives_the_same_weights(frames):
