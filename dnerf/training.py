@@ -116,6 +116,11 @@ class Trainer:
         for name, every in (loss_every or {}).items():
             if int(every) != every:
                 raise ValueError(f"loss_every.{name} must be a whole number of steps, got {every}")
+        for name, part, kind in (("time_window", time_window, TimeWindow), ("error_map", error_map, ErrorMap)):
+            if part is not None and not isinstance(part, kind):
+                raise ValueError(
+                    f"{name} must be of {kind.__name__} or null, got {part!r} (+trainer/{name}=... adds one)"
+                )
         if graphs and target_samples is None:
             raise ValueError("target_samples must be given with graphs, got null")
         self.num_steps = num_steps

@@ -107,6 +107,12 @@ def test_training_begins_with_a_map_that_knows_nothing(frames):
     assert torch.equal(weights(one), weights(two))
 
 
+@pytest.mark.parametrize("name", ["time_window", "error_map"])
+def test_the_name_of_a_part_is_no_part(name):
+    with pytest.raises(ValueError, match=f"{name} must be of .* or null, got 'guided'"):
+        trainer(**{name: "guided"})
+
+
 def test_same_seed_gives_the_same_weights(frames):
     one, two, other = small_renderer(), small_renderer(), small_renderer()
     trainer().fit(one, frames, seed=3)
