@@ -86,8 +86,10 @@ class ErrorMap(nn.Module):
         blocks = (frames * self.errors.shape[1] + rows // self.block) * self.errors.shape[2] + columns // self.block
         known = self.errors.view(-1)
         errors = torch.where(errors < UNSEEN, errors, UNSEEN).to(known.dtype).clamp(min=LEAST)
-        means = torch.zeros_like(known).scatter_reduce_(0, blocks, errors, "mean", include_self=False)
-        before, now = known[blocks], means[blocks]
+        sums, counts = (
+            torch.zeros_like(known).index_add_(0, blocks, each) for each in (errors, torch.ones_like(errors))
+        )
+        before, now = known[blocks], sums[blocks] / counts[blocks]
         known[blocks] = torch.where(before < UNSEEN, torch.lerp(now, before, self.memory), now)
 
     def _within(self, blocks: Tensor, unit: Tensor, side: int) -> Tensor:

@@ -1,10 +1,8 @@
 """Training a renderer on frames: random rays over all frames, Adam, schedules that follow steps and seconds."""
 
 import logging
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from signal import Signals
 
 import torch
 from torch import nn
@@ -17,15 +15,17 @@ from dnerf.data.frames import Frames
 from dnerf.distributed import Processes
 from dnerf.error_map import ErrorMap, draw_pixels
 from dnerf.graphs import GraphCache
+from dnerf.limits import Limits
 from dnerf.losses import Loss, PhotometricLoss
 from dnerf.optimizers import SCHEDULES, AdamMuon, rate_factor
-from dnerf.records import Callback, Outcome, TrainingRecord, check_finite, psnr_of, report, show
-from dnerf.recovery import SHOWN, Recovery
+from dnerf.records import Callback, Outcome, TrainingRecord
+from dnerf.recovery import Recovery
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder, RunState, advice_on_memory, fingerprint, max_bytes
 from dnerf.steps import Steps, next_num_rays, warm_up
-from dnerf.stopping import StopRequest, TrainingStopped, stop_requests
+from dnerf.stopping import StopRequest, stop_requests
 from dnerf.time_window import TimeWindow
+from dnerf.training_loop import TrainingLoop
 
 logger = logging.getLogger(__name__)
 
@@ -105,10 +105,8 @@ class Trainer:
         check_mapping("learning_rates", learning_rates or {}, allow_zero=True)
         check_mapping("loss_every", loss_every or {})
         for name, value in (
-            ("num_steps", num_steps), ("num_rays", num_rays), ("max_rays", max_rays), ("log_every", log_every),
+            ("num_rays", num_rays), ("max_rays", max_rays),
             ("final_learning_rate", final_learning_rate), ("marched_per_sample", marched_per_sample),
-            ("checkpoint_every", 1 if checkpoint_every is None else checkpoint_every),
-            ("max_seconds", 1 if max_seconds is None else max_seconds),
             ("target_samples", 1 if target_samples is None else target_samples),
         ):  # fmt: skip
             check_positive(name, value)
@@ -123,8 +121,7 @@ class Trainer:
                 )
         if graphs and target_samples is None:
             raise ValueError("target_samples must be given with graphs, got null")
-        self.num_steps = num_steps
-        self.max_seconds = max_seconds
+        self.limits = Limits(num_steps, max_seconds, log_every, checkpoint_every)
         self.num_rays = num_rays
         self.target_samples = target_samples
         self.max_rays = max_rays
@@ -143,8 +140,6 @@ class Trainer:
         self.loss_every = dict(loss_every or {})
         self.time_window = time_window
         self.error_map = error_map
-        self.log_every = log_every
-        self.checkpoint_every = checkpoint_every
         self.progress_bar = progress_bar
         self.recovery = recovery
         self.box_check = box_check
@@ -211,7 +206,13 @@ class Trainer:
         is_shown = self.progress_bar and processes.is_first
         bar = tqdm(total=100, disable=not is_shown, dynamic_ncols=True, bar_format=BAR)
         with bar, catching as request, processes.watched(), advice_on_memory(run):
-            self._loop(run, renderer, frames, processes, callbacks, checkpoints, request, bar)
+            steps = self._steps(run, renderer, processes.wrap(renderer), frames, processes)
+            loop = TrainingLoop(
+                run, renderer, processes,
+                limits=self.limits, recovery=self.recovery, callbacks=callbacks, checkpoints=checkpoints,
+                request=request, bar=bar,
+            )  # fmt: skip
+            loop.go(steps, lambda: self._step(run, renderer, steps, processes), lambda n: self._next_rays(run, n))
         if places is not None:
             renderer.sampler.fix_sizes(None)
         renderer.set_progress(1.0)
@@ -226,67 +227,6 @@ class Trainer:
         return AdamMuon.of(
             renderer, self.learning_rates, orthogonal=self.orthogonal, betas=self.betas, eps=self.epsilon
         )
-
-    def _loop(
-        self,
-        run: RunState,
-        renderer: Renderer,
-        frames: Frames,
-        processes: Processes,
-        callbacks: Sequence[Callback],
-        checkpoints: CheckpointFolder | None,
-        request: StopRequest,
-        bar: tqdm,
-    ) -> None:
-        """Steps, records and checkpoints until the end or a signal; every process takes the same turns."""
-        steps = self._steps(run, renderer, processes.wrap(renderer), frames, processes)
-        while not self._is_finished(run):
-            begin = time.perf_counter()
-            outcome = self._step(run, renderer, steps, processes)
-            if renderer.device.type == "cuda" and self._is_looked_at(run.step + 1):
-                torch.cuda.synchronize(renderer.device)  # looking stops the clock, not what is still at work
-            seconds = run.seconds + time.perf_counter() - begin
-            run.seconds, num_samples, signal = processes.agree(seconds, outcome.num_samples, request.number)
-            run.step += 1
-            used_rays = wanted_rays = run.num_rays
-            if self.target_samples is not None:
-                wanted_rays = next_num_rays(
-                    used_rays, num_samples, self.target_samples, self.max_rays, is_fixed=self.graphs, step=run.step
-                )
-            run.rays_done, run.num_rays = run.rays_done + used_rays, max(wanted_rays, processes.size)
-            ends = self._is_finished(run)
-            saves = checkpoints is not None and bool(ends or signal or self._is_due(run.step))
-            if ends or signal or self._is_looked_at(run.step):
-                record = self._examined(run, outcome, processes, used_rays, num_samples)
-                if record is None:
-                    steps.forget()
-                if record is not None and processes.is_first:
-                    report(record, renderer, callbacks)
-                    show(bar, record, self._progress(run), run.rays_done)
-            if checkpoints is not None and saves:
-                processes.merge_observations(renderer)
-                if processes.is_first:
-                    checkpoints.save(run, must_succeed=bool(ends or signal))
-            if signal and not ends:
-                raise TrainingStopped(signal, f"stopped by {Signals(signal).name} after step {run.step}, all saved")
-
-    def _examined(
-        self, run: RunState, outcome: Outcome, processes: Processes, used_rays: int, num_samples: int
-    ) -> TrainingRecord | None:
-        """The record of a step, or None if the run was broken and has been brought back."""
-        numbers, renderer = processes.mean(outcome.numbers()), run.modules["renderer"]
-        assert isinstance(renderer, Renderer)
-        psnr = psnr_of(numbers.pop("mse"))
-        shown = {name: numbers.pop(name) for name in SHOWN if name in numbers}
-        if self.recovery is not None and self.recovery.check(run.step, renderer, run.optimizer, numbers, shown):
-            run.rollbacks += 1
-            return None
-        check_finite(numbers, run.step, renderer)
-        record = TrainingRecord(
-            run.step, run.seconds, numbers, psnr, used_rays, num_samples, outcome.learning_rate_factor
-        )
-        run.record = vars(record)
-        return record
 
     def _places(self, processes: Processes) -> int | None:
         """Places that each process has for samples, if their number is fixed."""
@@ -310,7 +250,7 @@ class Trainer:
 
     def _step(self, run: RunState, renderer: Renderer, steps: Steps, processes: Processes) -> Outcome:
         """One optimiser step on this process's share of a random batch."""
-        progress, frames = self._progress(run), steps.frames
+        progress, frames = self.limits.progress(run.step, run.seconds, run.begun), steps.frames
         renderer.set_progress(progress)
         cooling = progress if self.time_window is None else self.time_window.since_open(progress)
         factor = rate_factor(self.schedule, self.final_learning_rate, self.warmup_steps, cooling, run.step)
@@ -319,7 +259,9 @@ class Trainer:
         steps.update(run.step)
         if self.box_check is not None:
             seen = run.step if self.time_window is None else self.time_window.steps_since_open(run.step, progress)
-            self.box_check(run.step, run.seconds, renderer, frames, max_seconds=self.max_seconds, with_all_frames=seen)
+            self.box_check(
+                run.step, run.seconds, renderer, frames, max_seconds=self.limits.max_seconds, with_all_frames=seen
+            )
         generator, num_rays = run.generator, run.num_rays
         drawn = draw_pixels(frames, num_rays, progress, self.time_window, self.error_map, generator=generator)
         indices = drawn[processes.share(num_rays)]
@@ -332,26 +274,16 @@ class Trainer:
             self.error_map.learn(drawn, processes.all_rays(errors, num_rays))
         return Outcome(scalars, weight, num_samples, factor)
 
+    def _next_rays(self, run: RunState, num_samples: int) -> int:
+        if self.target_samples is None:
+            return run.num_rays
+        return next_num_rays(
+            run.num_rays, num_samples, self.target_samples, self.max_rays, is_fixed=self.graphs, step=run.step
+        )
+
     def _restore(self, run: RunState, checkpoints: CheckpointFolder, processes: Processes) -> None:
         data = processes.from_first(lambda: checkpoints.read(max_bytes(run.modules)))
         if data is not None:
             run.restore(data, checkpoints.folder, max_rays=max(self.num_rays, self.max_rays))
             run.num_rays = max(run.num_rays, processes.size)
             logger.info("continuing after step %d", run.step)
-
-    def _is_finished(self, run: RunState) -> bool:
-        return run.step >= self.num_steps or (self.max_seconds is not None and run.seconds >= self.max_seconds)
-
-    def _is_looked_at(self, step: int) -> bool:
-        """What is saved is."""
-        return step in (1, self.num_steps) or step % self.log_every == 0 or self._is_due(step)
-
-    def _is_due(self, step: int) -> bool:
-        return self.checkpoint_every is not None and step % self.checkpoint_every == 0
-
-    def _progress(self, run: RunState) -> float:
-        of_time = 0.0
-        if self.max_seconds is not None:
-            left = self.max_seconds - run.begun
-            of_time = (run.seconds - run.begun) / left if left > 0 else 1.0
-        return min(max(run.step / self.num_steps, of_time), 1.0)

@@ -191,6 +191,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--mishaps", action="store_true", help="kill, hang and stop a process as well")
     given = parser.parse_args()
+    torch.set_num_threads(1)  # comparing large tensors begins threads otherwise, and forks of such a process hang
     result: dict[str, Any] = {model: compare(model, given.steps, given.processes) for model in MODELS}
     if given.mishaps:
         result["killed"] = mishap(signal.SIGKILL, 1, 60)

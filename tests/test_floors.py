@@ -35,6 +35,7 @@ FLOORS = {
     "renderer": 5,
     "scenes": 5,
     "data": 6,
+    "limits": 6,
     "losses": 6,
     "metrics": 6,
     "motion": 6,
@@ -61,6 +62,7 @@ FLOORS = {
     "temporal_evaluation": 7,
     "tracks": 7,
     "training": 7,
+    "training_loop": 7,
     "video": 7,
     "viewer": 7,
     # 8: looks at all of them from outside.
@@ -92,6 +94,10 @@ WITHIN_A_FLOOR = {
     ("training", "error_map"),
     ("training", "run_state"),
     ("training", "steps"),
+    ("training", "training_loop"),
+    ("training_loop", "distributed"),
+    ("training_loop", "run_state"),
+    ("training_loop", "steps"),
 }
 
 ONLY_SCRIPTS_KNOW = {"hydra", "omegaconf"}
