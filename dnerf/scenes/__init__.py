@@ -19,6 +19,7 @@ from dnerf.scenes.orbiting_balls import make_orbiting_balls
 from dnerf.scenes.poses import Pose
 from dnerf.scenes.pulsing_fog import make_pulsing_fog
 from dnerf.scenes.shapes import Ball, Box, Capsule, Shape
+from dnerf.scenes.snowman import make_snowman
 from dnerf.scenes.static import make_static
 from dnerf.scenes.textures import (
     Checker,
@@ -50,6 +51,7 @@ SCENES: dict[str, Callable[[], AnalyticScene]] = {
     "opaque_wall": make_opaque_wall,
     "orbiting_balls": make_orbiting_balls,
     "pulsing_fog": make_pulsing_fog,
+    "snowman": make_snowman,
     "static": make_static,
     "thin_rod": make_thin_rod,
     "twisting_block": make_twisting_block,
@@ -119,6 +121,7 @@ __all__ = [
     "make_orbiting_balls",
     "make_pulsing_fog",
     "make_scene",
+    "make_snowman",
     "make_static",
     "make_thin_rod",
     "make_twisting_block",

@@ -14,7 +14,7 @@ from dnerf.scenes import AnalyticScene, Ball, Body, Box, Fixed, Plain, make_scen
 
 HARD = [
     "thin_rod", "fast_ball", "opaque_wall", "merging_balls", "vanishing_ball", "jumping_ball", "twisting_block",
-    "bending_rod", "dense_fog", "bouncing_balls",
+    "bending_rod", "dense_fog", "bouncing_balls", "snowman",
 ]  # fmt: skip
 
 

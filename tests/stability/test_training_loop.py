@@ -136,6 +136,7 @@ def test_bfloat16_autocast_trains_like_float32(frames):
         "jumping_ball",
         "twisting_block",
         "bouncing_balls",
+        "snowman",
     ],
 )
 def test_hard_scenes_are_trained_on_without_failure(name):
