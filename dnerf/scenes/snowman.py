@@ -8,9 +8,8 @@ from dnerf.scenes.motions import Fixed, Joint, Wave
 from dnerf.scenes.shapes import Ball, Box
 from dnerf.scenes.textures import Checker, Gradient, Lit, Plain, Stripes, grid_planes
 
-SNOW = Stripes(
-    Gradient((0.84, 0.88, 0.94), (0.97, 0.98, 1.0)), Plain((1.0, 1.0, 1.0)), (0.0, 0.0, 2 * math.pi / 0.24)
-)  # fmt: skip
+PURE = Plain((1.0, 1.0, 1.0))
+SNOW = Stripes(Gradient((0.84, 0.88, 0.94), (0.97, 0.98, 1.0)), PURE, (0.0, 0.0, 2 * math.pi / 0.24))
 """Bands of pure white, and of white that is a little bluer below."""
 
 COAL = Lit(Checker(Plain((0.02, 0.02, 0.03)), Plain((0.09, 0.08, 0.08)), grid_planes(0.11, 2)))
