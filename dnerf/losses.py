@@ -28,6 +28,9 @@ class Loss(nn.Module, ABC):
             renderer: the model, for terms about its parameters or its field.
         """
 
+    def set_progress(self, progress: float) -> None:
+        """How much of training is over, in [0, 1], before each step; for terms that change with it."""
+
 
 class PhotometricLoss(Loss):
     """Mean squared or Huber error of colour, of the earlier (coarse) passes as well: NeRF eq. 6.
@@ -61,6 +64,45 @@ class PhotometricLoss(Loss):
         for proposal in rendering.proposals:
             loss = loss + self.proposal_weight * self._error(proposal.rgb, target)
         return loss
+
+
+class FadingLoss(Loss):
+    """Another term, times a factor that falls while training goes on: 1 until `begin`, `share` from `end` on.
+
+    In between it falls by equal ratios. For what a scene should do while it is being found, but need not do exactly.
+
+    Args:
+        loss: the term.
+        begin: fraction of training, in [0, 1), until which it counts in full.
+        end: fraction of training, in (begin, 1], from which on it counts `share` of that.
+        share: what is left, in (0, 1].
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(self, loss: Loss, *, begin: float = 0.3, end: float = 0.7, share: float = 0.03) -> None:
+        super().__init__()
+        if not 0 <= begin < end <= 1:
+            raise ValueError(f"begin and end must be 0 <= begin < end <= 1, got {begin} and {end}")
+        if not 0 < share <= 1:
+            raise ValueError(f"share must be in (0, 1], got {share}")
+        self.loss = loss
+        self.begin = begin
+        self.end = end
+        self.share = share
+        self.register_buffer("factor", torch.ones(()), persistent=False)  # a tensor: graphs that replay steps read it
+        self.factor: Tensor
+
+    def set_progress(self, progress: float) -> None:
+        """Set the factor to what it is when so much of training is over, `progress` in [0, 1]."""
+        faded = min(max((progress - self.begin) / (self.end - self.begin), 0.0), 1.0)
+        self.factor.fill_(self.share**faded)
+
+    def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
+        """The term times the factor."""
+        self.to(rendering.rgb.device)
+        return self.factor * self.loss(rendering, target, renderer)
 
 
 class OpacityEntropyLoss(Loss):

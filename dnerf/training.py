@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from typing import cast
 
 import torch
 from torch import nn
@@ -252,6 +253,8 @@ class Trainer:
         """One optimiser step on this process's share of a random batch."""
         progress, frames = self.limits.progress(run.step, run.seconds, run.begun), steps.frames
         renderer.set_progress(progress)
+        for loss in self.losses.values():
+            cast(Loss, loss).set_progress(progress)
         cooling = progress if self.time_window is None else self.time_window.since_open(progress)
         factor = rate_factor(self.schedule, self.final_learning_rate, self.warmup_steps, cooling, run.step)
         run.optimizer.set_rates(factor * (1.0 if self.recovery is None else self.recovery.factor))

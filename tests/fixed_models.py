@@ -5,13 +5,13 @@ import torch
 from dnerf.backgrounds import RandomBackground
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, GridField
-from dnerf.losses import HiddenMatterLoss, Loss, PhotometricLoss
-from dnerf.motion_losses import ElasticLoss, SteadyMatterLoss
+from dnerf.losses import FadingLoss, HiddenMatterLoss, Loss, PhotometricLoss
+from dnerf.motion_losses import ElasticLoss, SteadyMatterLoss, VolumeLoss
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
 
 BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
-LOSSES = ("rgb", "elastic", "steady", "hidden_matter")
+LOSSES = ("rgb", "elastic", "volume", "steady", "hidden_matter")
 
 
 def small_renderer(*, graphs: bool = False, device: str = "cpu", **sampling: object) -> Renderer:
@@ -27,6 +27,7 @@ def small_renderer(*, graphs: bool = False, device: str = "cpu", **sampling: obj
 
 
 def losses() -> dict[str, Loss]:
-    """Those of the fast path."""
-    terms = (PhotometricLoss(), ElasticLoss(), SteadyMatterLoss(), HiddenMatterLoss(BOX, memory_samples=200))
+    """Those of the fast path and of its flow."""
+    steady, hidden = SteadyMatterLoss(), HiddenMatterLoss(BOX, memory_samples=200)
+    terms = (PhotometricLoss(), ElasticLoss(), FadingLoss(VolumeLoss()), steady, hidden)
     return dict(zip(LOSSES, terms, strict=True))

@@ -10,7 +10,7 @@ from torch import Tensor
 from dnerf.compositing import FieldOutput, Rendering
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, RadianceField
-from dnerf.losses import HiddenMatterLoss, OpacityEntropyLoss, PhotometricLoss
+from dnerf.losses import FadingLoss, HiddenMatterLoss, OpacityEntropyLoss, PhotometricLoss
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, StratifiedSampler
 
@@ -43,6 +43,37 @@ def test_proposals_are_scored_with_their_weight(weight: float) -> None:
     loss = PhotometricLoss(proposal_weight=weight)(picture(rgb, proposals=(picture(coarse),)), target, RENDERER)
     expected = (rgb - target).square().mean() + weight * (coarse - target).square().mean()
     torch.testing.assert_close(loss, expected)
+
+
+def test_a_term_fades_by_equal_ratios() -> None:
+    rgb, target = torch.rand(10, 3), torch.rand(10, 3)
+    full = PhotometricLoss()(picture(rgb), target, RENDERER).item()
+    loss = FadingLoss(PhotometricLoss(), begin=0.2, end=0.6, share=0.01)
+    for progress, factor in ((0.0, 1), (0.2, 1), (0.3, 0.01**0.25), (0.4, 0.1), (0.6, 0.01), (1.0, 0.01), (0.1, 1)):
+        loss.set_progress(progress)
+        assert loss(picture(rgb), target, RENDERER).item() == pytest.approx(factor * full, rel=1e-5)
+
+
+def test_a_term_that_has_not_been_told_counts_in_full() -> None:
+    rgb, target = torch.rand(10, 3), torch.rand(10, 3)
+    expected = PhotometricLoss()(picture(rgb), target, RENDERER)
+    assert FadingLoss(PhotometricLoss())(picture(rgb), target, RENDERER) == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"begin": 0.7}, "begin < end <= 1, got 0.7 and 0.7"),
+        ({"begin": -0.1}, "0 <= begin"),
+        ({"end": 1.5}, "end <= 1"),
+        ({"begin": math.nan}, "0 <= begin"),
+        ({"share": 0.0}, r"share must be in \(0, 1\], got 0.0"),
+        ({"share": 2.0}, "share must be in"),
+    ],
+)
+def test_bad_settings_of_what_fades_are_named(settings: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FadingLoss(PhotometricLoss(), **settings)
 
 
 def test_entropy_is_that_of_a_coin() -> None:

@@ -1,7 +1,11 @@
 """Losses about motion against the closed forms of simple flows."""
 
+import math
+
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from dnerf.benchmarks.closed_flows import Expansion, Rotation, Shear
@@ -10,28 +14,22 @@ from dnerf.deformations import Deformation, DisplacementDeformation, FlowChain, 
 from dnerf.deformations.folding import folding
 from dnerf.deformations.velocities import NetworkVelocity, Velocity
 from dnerf.fields import DeformedField, GridField, RadianceField
-from dnerf.motion_losses import (
-    AccelerationLoss,
-    CycleConsistencyLoss,
-    DivergenceLoss,
-    ElasticLoss,
-    SmoothVelocityLoss,
-    SteadyMatterLoss,
-    spread_directions,
-)
+from dnerf.flow_losses import AccelerationLoss, CycleConsistencyLoss, DivergenceLoss, SmoothVelocityLoss
+from dnerf.motion_losses import ElasticLoss, SteadyMatterLoss, VolumeLoss, spread_directions
 from dnerf.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
 
 LOSSES = {
     "elastic": ElasticLoss,
+    "volume": VolumeLoss,
     "smooth": SmoothVelocityLoss,
     "divergence": DivergenceLoss,
     "acceleration": AccelerationLoss,
     "cycle": CycleConsistencyLoss,
 }
 every_loss = pytest.mark.parametrize("name", LOSSES)
-every_loss_of_flows = pytest.mark.parametrize("name", [name for name in LOSSES if name != "elastic"])
+every_loss_of_flows = pytest.mark.parametrize("name", [name for name in LOSSES if name not in ("elastic", "volume")])
 
 
 def renderer_of(velocity: Velocity, **settings: object) -> Renderer:
@@ -152,6 +150,58 @@ def test_gradient_is_finite_where_all_is_collapsed() -> None:
     renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
     ElasticLoss(1.0)(rendering(dtype=torch.float32), torch.zeros(8, 3), renderer).backward()
     assert torch.isfinite(deformation.matrix.grad).all()
+
+
+def volume(matrix: Tensor, **settings: float) -> Tensor:
+    renderer = Renderer(DeformedField(Linear(matrix), make_scene("static")), StratifiedSampler(4))
+    return VolumeLoss(1.0, **settings)(rendering(), torch.zeros(8, 3), renderer)
+
+
+def test_what_keeps_volumes_costs_nothing() -> None:
+    turned = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+    squeezed = torch.diag(torch.tensor([4.0, 0.5, 0.5], dtype=torch.float64))
+    sheared = torch.eye(3, dtype=torch.float64).index_put(
+        (torch.tensor(0), torch.tensor(2)), torch.tensor(1.7).double()
+    )
+    for matrix in (turned * turned.det().sign(), squeezed, sheared):
+        assert volume(matrix).item() < 1e-20
+
+
+@given(st.lists(st.floats(-2, 2), min_size=9, max_size=9), st.sampled_from([0.01, 0.1, 0.5]))
+def test_volumes_cost_the_square_of_their_logarithm_and_go_on_straight(entries: list[float], least: float) -> None:
+    matrix = torch.tensor(entries, dtype=torch.float64).reshape(3, 3)
+    determinant = float(torch.linalg.det(matrix))
+    expected = math.log(determinant) if determinant > least else math.log(least) + (determinant - least) / least
+    assert volume(matrix, least=least).item() == pytest.approx(expected**2, rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("thickness", [0.5, 0.05, 0.0, -1.0])
+def test_lost_volume_is_pulled_back(thickness: float) -> None:
+    deformation = Linear(torch.diag(torch.tensor([1.0, 1.0, thickness])))
+    renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
+    VolumeLoss(1.0)(rendering(dtype=torch.float32), torch.zeros(8, 3), renderer).backward()
+    assert torch.isfinite(deformation.matrix.grad).all()
+    assert deformation.matrix.grad[2, 2] < -1
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_keeps_volumes_unfolds(seed: int) -> None:
+    """A displacement too sharp folds space; minimising the loss alone leaves none that does, and some motion."""
+    torch.manual_seed(seed)
+    deformation = DisplacementDeformation(2, 32, (), position_frequencies=2, time_frequencies=2, canonical_time=None)
+    torch.nn.init.normal_(deformation.mlp.output.weight, std=0.2)
+    renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
+    picture = rendering(500, torch.float32)
+    picture.weights.fill_(1.0)
+    places = [picture.output.extras[name] for name in ("positions", "times")]
+    assert folding(deformation, *places).least_determinant < 0
+    optimizer = torch.optim.Adam(deformation.parameters(), 3e-3)
+    for _ in range(200):
+        optimizer.zero_grad()
+        VolumeLoss(1.0, 500)(picture, torch.zeros(8, 3), renderer).backward()
+        optimizer.step()
+    assert folding(deformation, *places).least_determinant > 0.1
+    assert (deformation(*places) - places[0]).norm(dim=-1).mean() > 0.1
 
 
 def test_directions_are_spread_evenly() -> None:
@@ -320,6 +370,8 @@ def test_a_field_without_deformation_is_named() -> None:
     ("make", "message"),
     [
         (lambda: ElasticLoss(distance=0.0), "distance must be > 0"),
+        (lambda: VolumeLoss(distance=0.0), "distance must be > 0"),
+        (lambda: VolumeLoss(least=-1.0), "least must be > 0"),
         (lambda: SteadyMatterLoss(length=0.0), "length must be > 0"),
         (lambda: SmoothVelocityLoss(-1.0), "weight must be >= 0"),
         (lambda: DivergenceLoss(1.0, 0), "num_points must be > 0"),

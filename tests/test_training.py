@@ -200,6 +200,16 @@ def test_losses_add_up_and_are_logged_by_name(frames):
     assert terms["haze"] > 0
 
 
+def test_losses_know_how_much_of_training_is_over(frames):
+    class Told(PhotometricLoss):
+        def set_progress(self, progress):
+            told.append(progress)
+
+    told = []
+    trainer(num_steps=5, losses={"rgb": Told()}).fit(small_renderer(), frames)
+    assert told == [0.0, 0.2, 0.4, 0.6, 0.8]
+
+
 def test_a_loss_that_takes_turns_counts_as_often(frames):
     records = []
     trainer(
