@@ -78,11 +78,13 @@ class FadingLoss(Loss):
         share: what is left, in (0, 1].
 
     Raises:
-        ValueError: for numbers out of range.
+        ValueError: for numbers out of range, or something else than a loss.
     """
 
     def __init__(self, loss: Loss, *, begin: float = 0.3, end: float = 0.7, share: float = 0.03) -> None:
         super().__init__()
+        if not isinstance(loss, Loss):
+            raise ValueError(f"loss must be a Loss, got {type(loss).__name__}")
         if not 0 <= begin < end <= 1:
             raise ValueError(f"begin and end must be 0 <= begin < end <= 1, got {begin} and {end}")
         if not 0 < share <= 1:

@@ -60,6 +60,11 @@ def test_a_term_that_has_not_been_told_counts_in_full() -> None:
     assert FadingLoss(PhotometricLoss())(picture(rgb), target, RENDERER) == expected
 
 
+def test_only_a_loss_fades() -> None:
+    with pytest.raises(ValueError, match="loss must be a Loss, got NoneType"):
+        FadingLoss(None)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
