@@ -100,6 +100,7 @@ class FadingLoss(Loss):
         """Set the factor to what it is when so much of training is over, `progress` in [0, 1]."""
         faded = min(max((progress - self.begin) / (self.end - self.begin), 0.0), 1.0)
         self.factor.fill_(self.share**faded)
+        self.loss.set_progress(progress)
 
     def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
         """The term times the factor."""

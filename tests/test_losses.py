@@ -60,6 +60,14 @@ def test_a_term_that_has_not_been_told_counts_in_full() -> None:
     assert FadingLoss(PhotometricLoss())(picture(rgb), target, RENDERER) == expected
 
 
+def test_what_fades_within_what_fades_is_told_too() -> None:
+    rgb, target = torch.rand(10, 3), torch.rand(10, 3)
+    full = PhotometricLoss()(picture(rgb), target, RENDERER).item()
+    loss = FadingLoss(FadingLoss(PhotometricLoss(), share=0.1), share=0.2)
+    loss.set_progress(1.0)
+    assert loss(picture(rgb), target, RENDERER).item() == pytest.approx(0.02 * full, rel=1e-5)
+
+
 def test_only_a_loss_fades() -> None:
     with pytest.raises(ValueError, match="loss must be a Loss, got NoneType"):
         FadingLoss(None)  # type: ignore[arg-type]

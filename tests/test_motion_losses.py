@@ -160,9 +160,8 @@ def volume(matrix: Tensor, **settings: float) -> Tensor:
 def test_what_keeps_volumes_costs_nothing() -> None:
     turned = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
     squeezed = torch.diag(torch.tensor([4.0, 0.5, 0.5], dtype=torch.float64))
-    sheared = torch.eye(3, dtype=torch.float64).index_put(
-        (torch.tensor(0), torch.tensor(2)), torch.tensor(1.7).double()
-    )
+    sheared = torch.eye(3, dtype=torch.float64)
+    sheared[0, 2] = 1.7
     for matrix in (turned * turned.det().sign(), squeezed, sheared):
         assert volume(matrix).item() < 1e-20
 
