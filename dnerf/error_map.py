@@ -53,6 +53,10 @@ class ErrorMap(nn.Module):
         rows, columns = (-(-side // self.block) for side in size)
         self.errors = torch.full((num_frames, rows, columns), UNSEEN, device=frames.images.device)
 
+    def num_even(self, count: int) -> int:
+        """How many of so many pixels are drawn evenly; they come first."""
+        return count - int(self.share * count)
+
     @torch.no_grad()
     def guide(self, indices: Tensor, frames_in: Tensor | None, *, generator: torch.Generator) -> Tensor:
         """Pixels of which the last share is drawn anew, where pictures are wrong.
@@ -65,7 +69,7 @@ class ErrorMap(nn.Module):
         Returns:
             (R,) int64.
         """
-        count = int(self.share * len(indices))
+        count = len(indices) - self.num_even(len(indices))
         height, width = self.size
         errors = self.errors if frames_in is None else self.errors.index_select(0, frames_in)
         bounds = errors.reshape(-1).cumsum(0, dtype=torch.float64)

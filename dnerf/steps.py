@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from dnerf.data.frames import Frames, composite_on
 from dnerf.graphs import GraphCache
+from dnerf.missing_matter import lacking_opacity
 from dnerf.optimizers import AdamMuon
 from dnerf.recovery import what_is_shown
 from dnerf.renderer import Renderer
@@ -32,6 +33,7 @@ class Steps:
         losses: terms by name, called as `Loss` is.
         loss_every: by name, steps between a term's turns, in which it counts as many times.
         shows: whether it is asked how much batches show, see `what_is_shown`.
+        lacks: whether it is asked how much they lack, see `lacking_opacity`.
         fixed: samples for which the sampler has places, if their number is fixed.
         graphs: replays steps, for a fixed number of samples; None for steps op by op.
     """
@@ -47,6 +49,7 @@ class Steps:
         losses: Mapping[str, nn.Module],
         loss_every: Mapping[str, int],
         shows: bool,
+        lacks: bool = False,
         fixed: int | None = None,
         graphs: GraphCache | None = None,
     ) -> None:
@@ -58,12 +61,18 @@ class Steps:
         self.losses = losses
         self.loss_every = loss_every
         self.shows = shows
+        self.lacks = lacks
         self.fixed = fixed
         self.graphs = graphs
         self._num_samples = fixed or 0
 
     def __call__(
-        self, indices: Tensor, number: int, weight: float, randomness: Callable[[], AbstractContextManager[None]]
+        self,
+        indices: Tensor,
+        number: int,
+        weight: float,
+        randomness: Callable[[], AbstractContextManager[None]],
+        num_even: int | None = None,
     ) -> tuple[dict[str, Tensor], Tensor, int]:
         """Learn from some pixels.
 
@@ -72,22 +81,23 @@ class Steps:
             number: of the step, counted from 1: some losses take turns.
             weight: of the batch's loss.
             randomness: what random draws are made in.
+            num_even: how many of the pixels, the first ones, were drawn evenly; None for all.
 
         Returns:
-            Scalars on the device: the terms whose turn it is, "loss", "mse" and what recovery looks at; and the squared
-            errors (R,) of the pixels; they hold until the next step. And the number of samples; of a fixed number of
-            places, how many were wanted when that was last looked at.
+            Scalars on the device: the terms whose turn it is, "loss", "mse" and what else was asked for; and the
+            squared errors (R,) of the pixels; they hold until the next step. And the number of samples; of a fixed
+            number of places, how many were wanted when that was last looked at.
         """
         turns = [name for name in self.losses if number % self.loss_every.get(name, 1) == 0]
 
         def work(indices: Tensor) -> dict[str, Tensor]:
             with randomness():
-                return self._optimize(indices, turns, weight)
+                return self._optimize(indices, turns, weight, len(indices) if num_even is None else num_even)
 
         if self.graphs is None:
             found: Mapping[str, Tensor] = work(indices)
         else:
-            state = (len(indices), weight, self.renderer.sampler.settings)
+            state = (len(indices), weight, num_even, self.renderer.sampler.settings)
             found = self.graphs.run(tuple(turns), state, work, indices)
         if self.fixed is not None and number % LOOK_EVERY == 0:
             self._num_samples = int(self.renderer.sampler.fullness() * self.fixed)
@@ -112,7 +122,7 @@ class Steps:
         if self.graphs is not None:
             self.graphs.forget()
 
-    def _optimize(self, indices: Tensor, turns: list[str], weight: float) -> dict[str, Tensor]:
+    def _optimize(self, indices: Tensor, turns: list[str], weight: float, num_even: int) -> dict[str, Tensor]:
         rays, rgba = self.frames.pixels(indices)
         rendering = self.model(rays, generator=self.generator)
         assert rendering.background is not None
@@ -130,6 +140,8 @@ class Steps:
             self.optimizer.step()
         errors = (rendering.rgb.detach() - target).square().mean(-1)
         shown = what_is_shown(rendering, target) if self.shows else {}
+        if self.lacks:
+            shown |= lacking_opacity(rendering, rgba, has_alpha=self.frames.has_alpha, num_even=num_even)
         found = {"loss": total, **terms, "mse": errors.mean(), **shown, ERRORS: errors}
         return {name: values.detach() for name, values in found.items()}
 

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from typing import cast
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
@@ -18,6 +18,7 @@ from dnerf.error_map import ErrorMap, draw_pixels
 from dnerf.graphs import GraphCache
 from dnerf.limits import Limits
 from dnerf.losses import Loss, PhotometricLoss
+from dnerf.missing_matter import LACKING, NEEDED, MissingMatterCheck
 from dnerf.optimizers import SCHEDULES, AdamMuon, rate_factor
 from dnerf.records import Callback, Outcome, TrainingRecord
 from dnerf.recovery import Recovery
@@ -66,6 +67,8 @@ class Trainer:
         time_window: lets frames in by time as training goes on, and holds learning rates until all are in; None for
             all from the start.
         error_map: draws a share of the rays where pictures are wrong; None draws all evenly.
+        missing_matter: lets waiting space-time volumes of the field join where motion does not explain the pictures;
+            None leaves them waiting.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
@@ -97,6 +100,7 @@ class Trainer:
         loss_every: Mapping[str, int] | None = None,
         time_window: TimeWindow | None = None,
         error_map: ErrorMap | None = None,
+        missing_matter: MissingMatterCheck | None = None,
         log_every: int = 20,
         checkpoint_every: int | None = 1000,
         progress_bar: bool = True,
@@ -115,7 +119,12 @@ class Trainer:
         for name, every in (loss_every or {}).items():
             if int(every) != every:
                 raise ValueError(f"loss_every.{name} must be a whole number of steps, got {every}")
-        for name, part, kind in (("time_window", time_window, TimeWindow), ("error_map", error_map, ErrorMap)):
+        kinds = (
+            ("time_window", time_window, TimeWindow),
+            ("error_map", error_map, ErrorMap),
+            ("missing_matter", missing_matter, MissingMatterCheck),
+        )
+        for name, part, kind in kinds:
             if part is not None and not isinstance(part, kind):
                 raise ValueError(
                     f"{name} must be of {kind.__name__} or null, got {part!r} (+trainer/{name}=... adds one)"
@@ -141,6 +150,7 @@ class Trainer:
         self.loss_every = dict(loss_every or {})
         self.time_window = time_window
         self.error_map = error_map
+        self.missing_matter = missing_matter
         self.progress_bar = progress_bar
         self.recovery = recovery
         self.box_check = box_check
@@ -245,7 +255,7 @@ class Trainer:
         return Steps(
             model, renderer, frames, run.optimizer, run.generator,
             losses=dict(self.losses.items()),
-            loss_every=self.loss_every, shows=self.recovery is not None,
+            loss_every=self.loss_every, shows=self.recovery is not None, lacks=self.missing_matter is not None,
             fixed=self._places(processes), graphs=graphs,
         )  # fmt: skip
 
@@ -267,15 +277,32 @@ class Trainer:
             )
         generator, num_rays = run.generator, run.num_rays
         drawn = draw_pixels(frames, num_rays, progress, self.time_window, self.error_map, generator=generator)
-        indices = drawn[processes.share(num_rays)]
+        share = processes.share(num_rays)
+        indices = drawn[share]
+        evenly = num_rays if self.error_map is None else self.error_map.num_even(num_rays)
         # Shares may differ by a ray: weighted so, their mean is that over all rays.
         weight = len(indices) * processes.size / num_rays
         scalars, errors, num_samples = steps(
-            indices, run.step + 1, weight, lambda: processes.same_randomness(generator, num_rays)
-        )
+            indices, run.step + 1, weight, lambda: processes.same_randomness(generator, num_rays),
+            num_even=min(max(evenly - share.start, 0), len(indices)),
+        )  # fmt: skip
         if self.error_map is not None:
             self.error_map.learn(drawn, processes.all_rays(errors, num_rays))
+        lacking = {name: scalars.pop(name) for name in (NEEDED, LACKING) if name in scalars}
+        if self._misses_matter(run, renderer, progress, {k: v * weight for k, v in lacking.items()}, processes):
+            steps.forget()
         return Outcome(scalars, weight, num_samples, factor)
+
+    def _misses_matter(
+        self, run: RunState, renderer: Renderer, progress: float, lacking: dict[str, Tensor], processes: Processes
+    ) -> bool:
+        """Let space-time volumes join if matter is missing; whether any did."""
+        check, window = self.missing_matter, self.time_window
+        if check is None or not check.is_due(run.step + 1, progress):
+            return False
+        if window is not None and window.steps_since_open(run.step, progress) is None:
+            return False
+        return check(run.step + 1, renderer, processes.mean({name: float(value) for name, value in lacking.items()}))
 
     def _next_rays(self, run: RunState, num_samples: int) -> int:
         if self.target_samples is None:

@@ -4,7 +4,7 @@ import torch
 
 from dnerf.backgrounds import RandomBackground
 from dnerf.deformations import DisplacementDeformation
-from dnerf.fields import DeformedField, GridField
+from dnerf.fields import DeformedField, GridField, SpaceTimeVolumes
 from dnerf.losses import FadingLoss, HiddenMatterLoss, Loss, PhotometricLoss
 from dnerf.motion_losses import ElasticLoss, SteadyMatterLoss, VolumeLoss
 from dnerf.renderer import Renderer
@@ -19,7 +19,15 @@ def small_renderer(*, graphs: bool = False, device: str = "cpu", **sampling: obj
     torch.manual_seed(0)
     field = DeformedField(
         DisplacementDeformation(2, 32, (), position_frequencies=2, time_frequencies=2),
-        GridField(BOX, (8, 16), 4, hidden_features=32, time_terms=2, window_end=0.4),
+        GridField(
+            BOX,
+            (8, 16),
+            4,
+            hidden_features=32,
+            time_terms=2,
+            window_end=0.4,
+            space_time=SpaceTimeVolumes(BOX, (8,), (4,)),
+        ),
     )
     options = {"num_probes": 512, "min_weight": 1e-4, "split_weight": 0.02, "splits": 2, "pad_to": 1, **sampling}
     sampler = OccupancySampler(BOX, 0.1, 16, **options)  # type: ignore[arg-type]

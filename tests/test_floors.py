@@ -39,6 +39,7 @@ FLOORS = {
     "limits": 6,
     "losses": 6,
     "metrics": 6,
+    "missing_matter": 6,
     "motion": 6,
     "motion_losses": 6,
     "optimizers": 6,

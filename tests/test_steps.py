@@ -42,7 +42,7 @@ def steps(renderer: Renderer, frames: Frames, seed: int = 0, *, replays: bool = 
     every = {"elastic": 2, "steady": 4, "hidden_matter": 4}
     return Steps(
         renderer, renderer, frames.to(device), optimizer, generator, losses=losses(), loss_every=every, shows=True,
-        fixed=fixed, graphs=graphs,
+        lacks=True, fixed=fixed, graphs=graphs,
     )  # fmt: skip
 
 
@@ -67,7 +67,7 @@ def test_a_step_waits_for_no_device(frames: Frames, splits: int, monkeypatch: py
         indices = pixels(frames, 8, 0, renderer.device)
         taken(indices, 4, 1.0, nullcontext)
         with DeviceWaits() as waits:
-            terms = taken._optimize(indices, list(LOSSES), 1.0)
+            terms = taken._optimize(indices, list(LOSSES), 1.0, len(indices))
     assert terms.keys() >= set(LOSSES)
     assert waits.found == []
 

@@ -6,5 +6,9 @@ from dnerf.fields.base import RadianceField
 from dnerf.fields.deformed import DeformedField
 from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
+from dnerf.fields.space_time import SpaceTimeVolumes
 
-__all__ = ["BakedField", "Baking", "DeformedField", "FieldOutput", "GridField", "NeRFField", "RadianceField"]
+__all__ = [
+    "BakedField", "Baking", "DeformedField", "FieldOutput", "GridField", "NeRFField", "RadianceField",
+    "SpaceTimeVolumes",
+]  # fmt: skip

@@ -12,6 +12,7 @@ from dnerf.deformations.base import check_positions_times
 from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField
+from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.geometry import check_last_axis
 from dnerf.kernels import GridLevels, grid_encode
 from dnerf.mlp import MLP
@@ -22,7 +23,7 @@ class GridField(RadianceField):
 
     Source: instant-ngp (Mueller et al. 2022): levels are dense while their vertices fit into `max_rows` rows and
     hashed beyond. Cells are cubes: a resolution counts cells along the box's longest side. Parts a scene does not
-    need do not exist: no change with time without `time_terms`, no directions without `view_degree`.
+    need do not exist: no change with time without `time_terms` or `space_time`, no directions without `view_degree`.
 
     Args:
         box: (2, 3) corners of the modelled space; positions outside see the features of the nearest face.
@@ -35,6 +36,8 @@ class GridField(RadianceField):
         time_terms: terms K of a cosine series in time, cos(k pi t) for k < K, that density and colour follow before
             their activations: folds and shading that change while matter moves. 1 for matter that is carried along
             and never changes.
+        space_time: features of place and time that the head sees, too: for what moves too fast, or in too many ways,
+            for a deformation to follow. None for a head that does not see any.
         view_degree: spherical-harmonics degree of the direction that a second, colour-only head sees; None for matte.
         density_activation: "softplus" or "exp".
         density_shift: added before the activation; negative for a thin start.
@@ -57,6 +60,7 @@ class GridField(RadianceField):
         num_layers: int = 2,
         time_frequencies: int | None = None,
         time_terms: int = 1,
+        space_time: SpaceTimeVolumes | None = None,
         view_degree: int | None = None,
         density_activation: str = "exp",
         density_shift: float = -1.0,
@@ -84,12 +88,15 @@ class GridField(RadianceField):
         self.table = nn.Parameter(torch.empty(self.levels.num_rows, num_features).uniform_(-1e-2, 1e-2))
         self.encode_times = None if time_frequencies is None else SinusoidalEncoding(1, time_frequencies)
         self.encode_directions = None if view_degree is None else SphericalHarmonicsEncoding(view_degree)
+        self.space_time = space_time
         self.time_terms = time_terms
         self.register_buffer("orders", torch.arange(time_terms), persistent=False)
         self.orders: Tensor
         in_features = num_features * self.levels.num_levels
         if self.encode_times is not None:
             in_features += self.encode_times.out_features
+        if space_time is not None:
+            in_features += space_time.out_features
         if self.encode_directions is None:
             self.head = MLP(in_features, hidden_features, num_layers, out_features=4 * time_terms)
             _begin_constant(self.head, 4, time_terms)
@@ -103,7 +110,12 @@ class GridField(RadianceField):
     @property
     def num_contents(self) -> int:
         """The head's outputs; none if it sees times or directions."""
-        return 4 * self.time_terms if self.encode_times is None and self.encode_directions is None else 0
+        sees_more = self.encode_times is not None or self.encode_directions is not None or self._sees_space_time
+        return 0 if sees_more else 4 * self.time_terms
+
+    @property
+    def _sees_space_time(self) -> bool:
+        return self.space_time is not None and self.space_time.has_joined
 
     def set_progress(self, progress: float) -> None:
         """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
@@ -122,6 +134,12 @@ class GridField(RadianceField):
         if self.encode_times is not None:
             assert times is not None
             features = torch.cat([features, self.encode_times(times[..., None])], dim=-1)
+        if self._sees_space_time:
+            assert times is not None
+            assert self.space_time is not None
+            features = torch.cat([features, self.space_time(positions, times)], dim=-1)
+        elif self.space_time is not None:
+            features = nn.functional.pad(features, (0, self.space_time.out_features))
         return self.head(features)
 
     def _activated(self, raw: Tensor) -> Tensor:

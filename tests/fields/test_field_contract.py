@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dnerf.deformations import DisplacementDeformation, IdentityDeformation
-from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField
+from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField, SpaceTimeVolumes
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,15 @@ def small_grid(time_frequencies: int | None = None, view_degree: int | None = No
     )  # fmt: skip
 
 
+def small_space_time(view_degree: int | None = None) -> GridField:
+    box = [[-1, -1.5, -1], [1, 1.5, 2]]
+    volumes = SpaceTimeVolumes(box, (4, 8), (3, 5), num_features=2)
+    return GridField(
+        box, (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1, time_terms=3, space_time=volumes,
+        view_degree=view_degree,
+    )  # fmt: skip
+
+
 FIELDS = {
     "nerf": Case(small_nerf, num_contents=4),
     "nerf, exp density": Case(lambda: small_nerf(density_activation="exp"), num_contents=4),
@@ -45,6 +54,8 @@ FIELDS = {
     "grid": Case(small_grid, num_contents=4),
     "grid, changing": Case(lambda: small_grid(time_terms=3), num_contents=12),
     "grid, changing and view-dependent": Case(lambda: small_grid(view_degree=2, time_terms=3), True),
+    "grid, space-time": Case(small_space_time),
+    "grid, space-time and view-dependent": Case(lambda: small_space_time(2), True),
     "grid, timed and view-dependent": Case(lambda: small_grid(time_frequencies=3, view_degree=2), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from dnerf.deformations import DisplacementDeformation
 from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
-from dnerf.fields import DeformedField, GridField, NeRFField
+from dnerf.fields import DeformedField, GridField, NeRFField, SpaceTimeVolumes
 from dnerf.fields.activations import activate_density
 from dnerf.geometry import se3_exp, so3_exp
 from dnerf.kernels import GridLevels, grid_encode, use_backend
@@ -19,6 +19,7 @@ FIELDS = {
     "nerf": lambda: NeRFField(4, 64, (2,), view_dependent=True),
     "grid": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, view_degree=3, time_frequencies=4),
     "grid, changing": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, time_terms=4),
+    "grid, space-time": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, space_time=SpaceTimeVolumes(BOX)),
     "deformed": lambda: DeformedField(moving(), GridField(BOX, (8, 16), 8)),
 }
 

@@ -1,0 +1,102 @@
+"""Features of places at times: products of three volumes, each over two axes of space and time."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.checks import as_box, check_positive
+from dnerf.deformations.base import check_positions_times
+from dnerf.kernels import GridLevels, grid_encode
+
+AXES = ((0, 1), (0, 2), (1, 2))
+"""The axes of space of each volume; time is its third."""
+
+
+class SpaceTimeVolumes(nn.Module):
+    """Features `(1 + a(x, y, t)) (1 + b(x, z, t)) (1 + c(y, z, t)) - 1`, interpolated at several resolutions.
+
+    A body that moves leaves a tube in each volume, and a place and time belong to it where all three tubes say so: four
+    dimensions at the price of three. It is zero, and the same at all times, as long as the tables are.
+
+    Source: Tensor4D's three time-aware volumes (arXiv 2211.11610, section 3.1), not cut into planes any further; joined
+    by products around one, as K-Planes (arXiv 2301.10241, section 3.1) joins its planes.
+
+    Args:
+        box: (2, 3) corners of the space; positions outside see the nearest face.
+        resolutions: cells along the box's longest side, per level.
+        time_resolutions: cells along time, per level.
+        num_features: features per level, F.
+        waits: whether they say nothing, and cost nothing, until they are let in by `join`.
+
+    Raises:
+        ValueError: for a box or sizes out of range, or levels of which one list has more.
+    """
+
+    def __init__(
+        self,
+        box: Sequence[Sequence[float]],
+        resolutions: Sequence[int] = (24, 48),
+        time_resolutions: Sequence[int] = (25, 50),
+        *,
+        num_features: int = 4,
+        waits: bool = False,
+    ) -> None:
+        super().__init__()
+        check_positive("num_features", num_features)
+        if len(resolutions) != len(time_resolutions):
+            raise ValueError(
+                f"time_resolutions must have as many levels as resolutions {list(resolutions)}, "
+                f"got {list(time_resolutions)}"
+            )
+        corners = as_box(box)
+        sides = corners[1] - corners[0]
+        shares = (sides / sides.max()).tolist()
+        self.levels = tuple(
+            _dense([[*(max(1, round(r * shares[k])) for k in axes), t] for r, t in zip(resolutions, time_resolutions)])
+            for axes in AXES
+        )
+        self.tables = nn.ParameterList(
+            nn.Parameter(torch.empty(levels.num_rows, num_features).uniform_(-1e-2, 1e-2)) for levels in self.levels
+        )
+        self.register_buffer("low", corners[0], persistent=False)
+        self.register_buffer("scale", 1 / sides, persistent=False)
+        self.low: Tensor
+        self.scale: Tensor
+        self.out_features = len(resolutions) * num_features
+        self.register_buffer("joined", torch.tensor(not waits), persistent=waits)
+        self.joined: Tensor
+        self._recall()
+        self.register_load_state_dict_post_hook(lambda module, _: module._recall())
+
+    def _recall(self) -> None:
+        self._has_joined = bool(self.joined)
+
+    @property
+    def has_joined(self) -> bool:
+        """Whether they are in use; without waiting for a device."""
+        return self._has_joined
+
+    def join(self) -> None:
+        """End the wait."""
+        self.joined = torch.ones_like(self.joined)  # elsewhere in memory: recorded graphs of the model are out of date
+        self._recall()
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Features (..., L F), level by level, at positions (..., 3) and times (...,) in [0, 1]; 0 while they wait."""
+        check_positions_times(positions, times)
+        dtype = positions.dtype
+        if not self.has_joined:
+            return positions.new_zeros(*times.shape, self.out_features)
+        unit = ((positions - self.low.to(dtype)) * self.scale.to(dtype)).reshape(-1, 3)
+        columns = [*unit.unbind(-1), times.to(dtype).reshape(-1)]
+        a, b, c = (
+            grid_encode(torch.stack([columns[i], columns[j], columns[3]], dim=-1), table, levels)
+            for (i, j), table, levels in zip(AXES, self.tables, self.levels, strict=True)
+        )
+        return ((1 + a) * (1 + b) * (1 + c) - 1).reshape(*times.shape, self.out_features)
+
+
+def _dense(cells: list[list[int]]) -> GridLevels:
+    """Levels of which every vertex has a row of its own."""
+    return GridLevels(cells, 1 << (max(GridLevels(cells, 1).vertices) - 1).bit_length())
