@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from dnerf.checks import as_box, check_choice, check_positive
 from dnerf.compositing import Rendering
-from dnerf.fields import DeformedField
+from dnerf.fields import DeformedField, SpaceTimeVolumes
 from dnerf.renderer import Renderer
 
 SHARE_THAT_IS_SEEN = 1e-3
@@ -220,3 +220,36 @@ class HiddenMatterLoss(Loss):
         unit = (positions - self.box[0]) / (self.box[1] - self.box[0])
         x, y, z = (unit * size).long().clamp(0, size - 1).unbind(-1)
         return (x * size + y) * size + z
+
+
+class SmoothVolumesLoss(Loss):
+    """Roughness of space-time volumes that have joined: each moment is seen from one side, and moments are alike.
+
+    Squared differences of neighbours in space and second differences in time, means over each table: what moves evenly
+    costs nothing in time, so that what one picture leaves open is as in those before and after.
+
+    Source: K-Planes (arXiv 2301.10241) section 3.2, total variation in space and smoothness in time.
+
+    Args:
+        space_weight: factor of the differences in space.
+        time_weight: of those in time.
+
+    Raises:
+        ValueError: for a negative weight.
+    """
+
+    def __init__(self, space_weight: float = 1e-2, time_weight: float = 1e-2) -> None:
+        super().__init__()
+        check_positive("space_weight", space_weight, allow_zero=True)
+        check_positive("time_weight", time_weight, allow_zero=True)
+        self.space_weight = space_weight
+        self.time_weight = time_weight
+
+    def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
+        """See `Loss`; only the field matters here, and one without volumes, or with such that wait, costs nothing."""
+        total = rendering.rgb.new_zeros(())
+        for part in renderer.field.modules():
+            if isinstance(part, SpaceTimeVolumes) and part.has_joined:
+                in_space, in_time = part.roughness()
+                total = total + self.space_weight * in_space + self.time_weight * in_time
+        return total

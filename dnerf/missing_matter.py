@@ -56,7 +56,7 @@ class MissingMatterCheck:
         ValueError: for numbers out of range.
     """
 
-    def __init__(self, share: float = 0.1, *, begin: float = 0.35, end: float = 0.6, every: int = 8) -> None:
+    def __init__(self, share: float = 0.06, *, begin: float = 0.35, end: float = 0.6, every: int = 8) -> None:
         check_positive("share", share)
         check_positive("begin", begin, allow_zero=True)
         check_positive("every", every)

@@ -27,8 +27,9 @@ from dnerf.data import SyntheticData
 from dnerf.deformations import DisplacementDeformation
 from dnerf.distributed import LostProcess, Processes, started
 from dnerf.error_map import ErrorMap
-from dnerf.fields import DeformedField, GridField, NeRFField
+from dnerf.fields import DeformedField, GridField, NeRFField, SpaceTimeVolumes
 from dnerf.losses import Loss, PhotometricLoss
+from dnerf.missing_matter import MissingMatterCheck
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder
 from dnerf.samplers import ImportanceSampler, OccupancySampler
@@ -50,11 +51,13 @@ def mlp() -> tuple[Renderer, dict[str, Any]]:
 
 
 def grid() -> tuple[Renderer, dict[str, Any]]:
-    """The fast path: rays adapted to samples; occupancy and errors that are known from what each process sees."""
-    canonical = GridField(BOX, (8, 16, 32), 4, hidden_features=16)
+    """The fast path: rays adapted to samples; occupancy, errors and missing matter, known from what each sees."""
+    volumes = SpaceTimeVolumes(BOX, (4,), (4,), waits=True)
+    canonical = GridField(BOX, (8, 16, 32), 4, hidden_features=16, space_time=volumes, density_shift=-4.0)
     sampler = OccupancySampler(BOX, 0.1, 24, num_slabs=4, update_every=4, num_probes=512, pad_to=1)
     return Renderer(DeformedField(deformation(), canonical), sampler, RandomBackground()), {
         "num_rays": 64, "target_samples": 1500, "error_map": ErrorMap(resolution=8),
+        "missing_matter": MissingMatterCheck(0.01, begin=0.4, every=2),
     }  # fmt: skip
 
 
@@ -159,6 +162,7 @@ def compare(model: str, steps: int, count: int) -> dict[str, Any]:
         "occupancy_equal": all(torch.equal(one[name], first[name]) for name in one.keys() - set(floats)),
         "occupied": [float(value.float().mean()) for name, value in one.items() if name.endswith("occupied")],
         "processes_equal": all(torch.equal(first[name], o["state"][name]) for o in several[1:] for name in first),
+        "joined": [bool(value) for name, value in one.items() if name.endswith("joined")],
         "num_rays_equal": all(a["num_rays"] == b["num_rays"] for a, b in records),
         "num_rays_vary": len({a["num_rays"] for a, _ in records}) > 1,
         "loss_difference": max(abs(a["losses"]["loss"] - b["losses"]["loss"]) for a, b in records),

@@ -32,12 +32,15 @@ def test_two_processes_train_as_one_does(outcome: dict[str, Any], model: str) ->
     assert result["num_rays_equal"]
 
 
-def test_occupancy_is_the_same_in_all_processes_and_as_one_alone_has_it(outcome: dict[str, Any]) -> None:
+def test_occupancy_and_what_joins_are_the_same_in_all_processes_and_in_one_alone(
+    outcome: dict[str, Any],
+) -> None:
     result = outcome["grid"]
     assert 0 < result["occupied"][0] < 1  # something was decided
     assert result["occupancy_equal"]
     assert result["processes_equal"]
     assert result["num_rays_vary"]
+    assert result["joined"] == [True]
 
 
 @pytest.mark.parametrize("model", ["mlp", "grid"])

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dnerf.compositing import FieldOutput, Rendering
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
-from dnerf.fields import DeformedField, GridField, RadianceField
-from dnerf.losses import FadingLoss, HiddenMatterLoss, OpacityEntropyLoss, PhotometricLoss
+from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes
+from dnerf.losses import FadingLoss, HiddenMatterLoss, OpacityEntropyLoss, PhotometricLoss, SmoothVolumesLoss
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, StratifiedSampler
 
@@ -249,3 +249,20 @@ def test_bad_settings_of_hidden_matter_are_named(setting: dict[str, float]) -> N
 def test_hidden_matter_wants_a_deformed_field() -> None:
     with pytest.raises(ValueError, match="HiddenMatterLoss needs a deformed field, got FormulaField"):
         HiddenMatterLoss(BOX)(NOTHING, TARGET, RENDERER)
+
+
+def test_rough_volumes_cost_once_they_have_joined() -> None:
+    box = [[-1.0] * 3, [1.0] * 3]
+    volumes = SpaceTimeVolumes(box, (4,), (1,), waits=True)
+    field = DeformedField(IdentityDeformation(), GridField(box, (4,), 2, space_time=volumes))
+    renderer, rgb = Renderer(field, StratifiedSampler(4)), torch.zeros(2, 3)
+    assert SmoothVolumesLoss()(picture(rgb), rgb, renderer).item() == 0
+    volumes.join()
+    in_space, in_time = (float(x.detach()) for x in volumes.roughness())
+    assert in_space > 0 == in_time  # two moments have no second difference
+    loss = SmoothVolumesLoss(0.5, 7.0)(picture(rgb), rgb, renderer)
+    assert loss.item() == pytest.approx(0.5 * in_space)
+    assert torch.autograd.grad(loss, volumes.tables[0])[0].abs().sum() > 0
+    assert SmoothVolumesLoss()(picture(rgb), rgb, RENDERER).item() == 0
+    with pytest.raises(ValueError, match="time_weight must be >= 0"):
+        SmoothVolumesLoss(time_weight=-1.0)

@@ -96,6 +96,21 @@ class SpaceTimeVolumes(nn.Module):
         )
         return ((1 + a) * (1 + b) * (1 + c) - 1).reshape(*times.shape, self.out_features)
 
+    def roughness(self) -> tuple[Tensor, Tensor]:
+        """Mean squared differences of neighbours in space, and second differences in time, of all tables; scalars."""
+        space, time = [], []
+        for table, levels in zip(self.tables, self.levels, strict=True):
+            for (u, v, t), first, end in zip(levels.resolutions, levels.offsets, levels.offsets[1:], strict=False):
+                values = table[first:end].view(t + 1, v + 1, u + 1, -1)
+                space += [_mean_square(values.diff(dim=axis)) for axis in (1, 2)]
+                time.append(_mean_square(values.diff(n=2, dim=0)))
+        return torch.stack(space).sum(), torch.stack(time).sum()
+
+
+def _mean_square(values: Tensor) -> Tensor:
+    """0 for none, as of second differences between two moments."""
+    return values.square().sum() / max(values.numel(), 1)
+
 
 def _dense(cells: list[list[int]]) -> GridLevels:
     """Levels of which every vertex has a row of its own."""

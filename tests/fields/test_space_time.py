@@ -157,3 +157,20 @@ def test_bad_volumes_are_refused(arguments: tuple, message: str) -> None:
 def test_times_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="times"):
         filled()(torch.zeros(4, 3), torch.zeros(3))
+
+
+def test_roughness_is_of_differences_in_space_and_of_second_differences_in_time() -> None:
+    volumes = SpaceTimeVolumes([[0, 0, 0], [1, 1, 1]], (4, 2), (3, 5), num_features=2).double()
+    for table in volumes.tables:
+        torch.nn.init.constant_(table, 0.7)
+    assert [float(x.detach()) for x in volumes.roughness()] == [0, 0]
+    slopes = (0.5, -2.0, 3.0)  # along the first axis of space, the second, and time squared
+    with torch.no_grad():
+        for table, levels in zip(volumes.tables, volumes.levels, strict=True):
+            for (u, v, t), first in zip(levels.resolutions, levels.offsets[:2], strict=True):
+                grids = torch.meshgrid(*(torch.arange(n + 1.0) for n in (t, v, u)), indexing="ij")
+                values = slopes[0] * grids[2] + slopes[1] * grids[1] + slopes[2] * grids[0] ** 2 / 2 + 5 * grids[0]
+                table[first : first + values.numel()] = values.reshape(-1, 1).double()
+    in_space, in_time = volumes.roughness()
+    assert float(in_space.detach()) == pytest.approx(3 * 2 * (slopes[0] ** 2 + slopes[1] ** 2))  # volumes, levels
+    assert float(in_time.detach()) == pytest.approx(3 * 2 * slopes[2] ** 2)
