@@ -191,6 +191,19 @@ def test_weights_know_whether_they_have_joined(tmp_path: Path) -> None:
     assert "joined" not in SpaceTimeVolumes(BOX).state_dict()
 
 
+def test_a_model_brought_back_waits_again() -> None:
+    """Its flag lies elsewhere in memory then, and once they join: recorded graphs know a model by its addresses."""
+    renderer = a_renderer()
+    volumes, state = volumes_of(renderer), {name: value.clone() for name, value in renderer.state_dict().items()}
+    places = [volumes.joined.data_ptr()]
+    volumes.join()
+    places.append(volumes.joined.data_ptr())
+    renderer.load_state_dict(state)
+    places.append(volumes.joined.data_ptr())
+    assert not volumes.has_joined
+    assert places[0] != places[1] != places[2]
+
+
 def test_a_price_on_change_holds_for_them_too(frames: Frames) -> None:
     """`steady` looks at contents where a field has them; once volumes have joined, at what the field shows."""
     renderer = a_renderer()

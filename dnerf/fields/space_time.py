@@ -70,6 +70,8 @@ class SpaceTimeVolumes(nn.Module):
         self.register_load_state_dict_post_hook(lambda module, _: module._recall())
 
     def _recall(self) -> None:
+        """See whether the wait is over."""
+        self.joined = self.joined.clone()  # elsewhere in memory: recorded graphs of the model may be out of date
         self._has_joined = bool(self.joined)
 
     @property
@@ -79,7 +81,7 @@ class SpaceTimeVolumes(nn.Module):
 
     def join(self) -> None:
         """End the wait."""
-        self.joined = torch.ones_like(self.joined)  # elsewhere in memory: recorded graphs of the model are out of date
+        self.joined.fill_(True)
         self._recall()
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
@@ -100,8 +102,8 @@ class SpaceTimeVolumes(nn.Module):
         """Mean squared differences of neighbours in space, and second differences in time, of all tables; scalars."""
         space, time = [], []
         for table, levels in zip(self.tables, self.levels, strict=True):
-            for (u, v, t), first, end in zip(levels.resolutions, levels.offsets, levels.offsets[1:], strict=False):
-                values = table[first:end].view(t + 1, v + 1, u + 1, -1)
+            for (u, v, t, first, _), size in zip(levels.describe(), levels.vertices, strict=True):
+                values = table[first : first + size].view(t + 1, v + 1, u + 1, -1)
                 space += [_mean_square(values.diff(dim=axis)) for axis in (1, 2)]
                 time.append(_mean_square(values.diff(n=2, dim=0)))
         return torch.stack(space).sum(), torch.stack(time).sum()
