@@ -1,5 +1,8 @@
 """Space-time volumes: products of three interpolated tables, and what they can say."""
 
+import itertools
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -27,31 +30,25 @@ def some_places(count: int = 50, dtype: torch.dtype = torch.float64) -> tuple[Te
     return torch.lerp(corners[0], corners[1], unit), torch.rand(count, generator=generator, dtype=dtype)
 
 
+CELLS = [[(2, 1, 2), (4, 2, 4)], [(2, 4, 2), (4, 8, 4)], [(1, 4, 2), (2, 8, 4)]]
+"""Of the levels of each volume of `filled`, along two axes of a box of 2 x 1 x 4 and along time."""
+
+
 def looked_up(volumes: SpaceTimeVolumes, place: list[float], time: float) -> Tensor:
     """One place's features, vertex by vertex."""
     unit = [(p - low) / (high - low) for p, low, high in zip(place, *BOX, strict=True)]
-    features = []
-    for level, (size, moments) in enumerate(((4, 2), (8, 4))):
-        cells = [round(size * side / 4) for side in (2, 1, 4)]
+    features, first = [], [0, 0, 0]
+    for level in range(2):
         product = torch.ones(3, dtype=torch.float64)
         for number, (i, j) in enumerate(AXES):
-            counts = (cells[i], cells[j], moments)
-            coarse = (cells[i] + 1) * (cells[j] + 1) * (moments + 1)
-            if level == 1:
-                first = (round(4 * (2, 1, 4)[i] / 4) + 1) * (round(4 * (2, 1, 4)[j] / 4) + 1) * 3
-                rows = volumes.tables[number].detach()[first:]
-            else:
-                rows = volumes.tables[number].detach()[:coarse]
-            sum_ = torch.ones(3, dtype=torch.float64)
-            scaled = [u * n for u, n in zip((unit[i], unit[j], time), counts, strict=True)]
-            for a in range(counts[0] + 1):
-                for b in range(counts[1] + 1):
-                    for c in range(counts[2] + 1):
-                        weight = 1.0
-                        for s, vertex in zip(scaled, (a, b, c), strict=True):
-                            weight *= max(0.0, 1 - abs(s - vertex))
-                        sum_ = sum_ + weight * rows[a + (counts[0] + 1) * (b + (counts[1] + 1) * c)]
-            product = product * sum_
+            cells, table = CELLS[number][level], volumes.tables[number].detach()
+            scaled = [u * n for u, n in zip((unit[i], unit[j], time), cells, strict=True)]
+            factor, row = torch.ones(3, dtype=torch.float64), first[number]
+            for vertex in itertools.product(*(range(n + 1) for n in reversed(cells))):  # the first axis is fastest
+                weight = math.prod(max(0.0, 1 - abs(s - v)) for s, v in zip(scaled, reversed(vertex), strict=True))
+                factor = factor + weight * table[row]
+                row += 1
+            product, first[number] = product * factor, row
         features.append(product - 1)
     return torch.cat(features)
 
