@@ -30,13 +30,10 @@ def lacking_opacity(rendering: Rendering, rgba: Tensor, *, has_alpha: bool, num_
     Returns:
         Two scalars, sums over the rays that count by the number of all.
     """
-    needed = rgba[:, 3] if has_alpha else (rgba[:, :3] - _background(rendering)).abs().amax(-1)
+    background = 0.0 if rendering.background is None else rendering.background.detach()
+    needed = rgba[:, 3] if has_alpha else (rgba[:, :3] - background).abs().amax(-1)
     lacking = torch.where(rendering.opacity.detach() < needed / 2, needed, 0)
     return {name: x[:num_even].sum() / max(len(x), 1) for name, x in ((NEEDED, needed), (LACKING, lacking))}
-
-
-def _background(rendering: Rendering) -> Tensor | float:
-    return 0.0 if rendering.background is None else rendering.background.detach()
 
 
 class MissingMatterCheck:

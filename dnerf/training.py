@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
@@ -289,20 +289,12 @@ class Trainer:
         if self.error_map is not None:
             self.error_map.learn(drawn, processes.all_rays(errors, num_rays))
         lacking = {name: scalars.pop(name) for name in (NEEDED, LACKING) if name in scalars}
-        if self._misses_matter(run, renderer, progress, {k: v * weight for k, v in lacking.items()}, processes):
-            steps.forget()
+        check, all_in = self.missing_matter, self.time_window is None or progress >= self.time_window.end
+        if check is not None and all_in and check.is_due(run.step + 1, progress):
+            found = processes.mean({name: float(value) * weight for name, value in lacking.items()})
+            if check(run.step + 1, renderer, found):
+                steps.forget()
         return Outcome(scalars, weight, num_samples, factor)
-
-    def _misses_matter(
-        self, run: RunState, renderer: Renderer, progress: float, lacking: dict[str, Tensor], processes: Processes
-    ) -> bool:
-        """Let space-time volumes join if matter is missing; whether any did."""
-        check, window = self.missing_matter, self.time_window
-        if check is None or not check.is_due(run.step + 1, progress):
-            return False
-        if window is not None and window.steps_since_open(run.step, progress) is None:
-            return False
-        return check(run.step + 1, renderer, processes.mean({name: float(value) for name, value in lacking.items()}))
 
     def _next_rays(self, run: RunState, num_samples: int) -> int:
         if self.target_samples is None:

@@ -139,6 +139,14 @@ def test_they_join_in_training_and_learn_from_then_on(frames: Frames) -> None:
     assert renderer.field.canonical.num_contents == 0
 
 
+def test_volumes_that_wait_say_nothing() -> None:
+    volumes = volumes_of(a_renderer())
+    positions, times = torch.rand(7, 3), torch.rand(7)
+    assert torch.equal(volumes(positions, times), torch.zeros(7, 2))
+    volumes.join()
+    assert volumes(positions, times).abs().max() > 0
+
+
 def test_they_wait_until_all_frames_are_in(frames: Frames) -> None:
     joined: list[bool] = []
     trainer(time_window=TimeWindow(0.5, end=0.7)).fit(
