@@ -156,7 +156,7 @@ def test_they_wait_until_all_frames_are_in(frames: Frames) -> None:
 
 
 def test_they_go_on_waiting_where_enough_is_shown_and_cost_nothing(frames: Frames) -> None:
-    """Then training is, to the last bit, one without the check and with a field that has them and never asks."""
+    """Then training is, to the last bit, one without the check, with the same field."""
     weights = []
     for check in (MissingMatterCheck(0.999, begin=0.4, every=4), None):
         renderer = a_renderer(density_shift=0.0)
