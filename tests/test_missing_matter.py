@@ -14,6 +14,7 @@ from dnerf.compositing import Rendering
 from dnerf.data import SyntheticData
 from dnerf.data.frames import Frames
 from dnerf.deformations import IdentityDeformation
+from dnerf.error_map import ErrorMap
 from dnerf.fields import DeformedField, GridField, SpaceTimeVolumes
 from dnerf.missing_matter import LACKING, NEEDED, MissingMatterCheck, lacking_opacity
 from dnerf.motion_losses import SteadyMatterLoss
@@ -86,7 +87,7 @@ def test_volumes_join_where_more_than_a_share_is_lacking(lacking: float, joins: 
     model, check = a_renderer(), MissingMatterCheck(0.1)
     assert check(7, model, {NEEDED: 0.1, LACKING: lacking}) == joins
     assert volumes_of(model).has_joined == joins
-    assert not check(8, model, {NEEDED: 0.1, LACKING: 0.1}) or not joins  # once is enough
+    assert check(8, model, {NEEDED: 0.1, LACKING: 0.1}) != joins  # those that have joined do not join again
 
 
 def test_a_batch_without_matter_and_a_model_without_volumes_are_left_alone() -> None:
@@ -137,6 +138,21 @@ def test_they_join_in_training_and_learn_from_then_on(frames: Frames) -> None:
     trainer().fit(renderer, frames, callbacks=[look])
     assert seen == [(1, False, True), (6, False, True), (12, True, True), (18, True, False), (24, True, False)]
     assert renderer.field.canonical.num_contents == 0
+
+
+def test_rays_drawn_where_pictures_are_wrong_do_not_count(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: list[tuple[int, int]] = []
+
+    def watched(seen: Rendering, rgba: torch.Tensor, *, has_alpha: bool, num_even: int) -> dict[str, torch.Tensor]:
+        counted.append((num_even, len(rgba)))
+        return lacking_opacity(seen, rgba, has_alpha=has_alpha, num_even=num_even)
+
+    monkeypatch.setattr("dnerf.steps.lacking_opacity", watched)
+    for error_map, share in ((None, 0.0), (ErrorMap(share=0.25, resolution=8), 0.25)):
+        counted.clear()
+        trainer(num_steps=3, error_map=error_map).fit(a_renderer(), frames)
+        assert len(counted) == 3
+        assert all(even == count - int(share * count) for even, count in counted)
 
 
 def test_volumes_that_wait_say_nothing() -> None:
