@@ -28,11 +28,11 @@ NUM_STATIONS = 8
 
 
 def motion_model(field: RadianceField | Renderer) -> MotionModel:
-    """What moves matter in a field or renderer: its deformation, or the analytic scene itself; identity if none."""
+    """What moves matter in a field or renderer: see `DeformedField.motion`; or the scene itself; identity if none."""
     if isinstance(field, Renderer):
         field = field.field
     if isinstance(field, DeformedField):
-        return field.deformation
+        return field.motion
     return field if isinstance(field, AnalyticScene) else IdentityDeformation()
 
 

@@ -21,6 +21,7 @@ from dnerf.deformations.folding import folding
 from dnerf.evaluation import spread_indices
 from dnerf.files import write_json
 from dnerf.motion import Trajectories, motion_model
+from dnerf.motion_search import has_unknown_motion
 from dnerf.renderer import Renderer
 from dnerf.tracks import render_tracks, seen_points
 from dnerf.video import FORMATS, write_frames, write_png
@@ -61,6 +62,8 @@ def main(config: DictConfig) -> None:
     np.savez_compressed(output.parent / f"{output.stem}.npz", **arrays)
     print(f"{points.shape[0]} tracks over {len(frames)} frames: {output}, {still}")
     print(f"residual: median {tracks.residuals.median():.2e}, largest {tracks.residuals.max():.2e} world units")
+    if has_unknown_motion(renderer):
+        print("note: what space-time volumes show moves as no one knows; train with motion_search=contents to find out")
     model = motion_model(renderer)
     if isinstance(model, Deformation):
         _print_folding(model, tracks)

@@ -1,6 +1,7 @@
 """Train a model: python scripts/train.py experiment=demo [data=blender data.root=... out_dir=... key=value ...]"""
 
 import json
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -58,7 +59,6 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     num_parameters = sum(p.numel() for p in renderer.parameters())
     if not processes.is_first:
         return
-    save_weights(renderer, folder / "model.safetensors")
     training = {
         "train_seconds": record.seconds,
         "num_steps": record.step,
@@ -70,6 +70,8 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     if resume and _is_scored(folder, config, training):
         print(f"{folder}: finished before, nothing to do")
         return
+    _search_motion(config, renderer, frames)
+    save_weights(renderer, folder / "model.safetensors")
     write_json(folder / "training.json", training)
     if config.evaluate_split is not None:
         print_scores(
@@ -118,6 +120,20 @@ def _fit(
         )
     except BoxTooLarge as found:
         return found.with_traceback(None)  # which holds the model
+
+
+def _search_motion(config: DictConfig, renderer: Renderer, frames: Frames) -> None:
+    """Read the motion off the trained field that its deformation does not know of, if that is wanted and there is."""
+    if config.get("motion_search") is None:  # runs of before there was any have no such setting
+        return
+    start = time.perf_counter()
+    found = build(config.motion_search)(renderer, frames, seed=config.seed, progress_bar=config.trainer.progress_bar)
+    if found is not None:
+        said = "found" if found.is_motion else "none found"
+        print(
+            f"remaining motion: {said} in {time.perf_counter() - start:.0f} s; what canonical space holds changes by "
+            f"{found.before:.4f}, along its tracks by {found.after:.4f}"
+        )
 
 
 def _is_scored(folder: Path, config: DictConfig, training: dict[str, Any]) -> bool:

@@ -57,6 +57,7 @@ FLOORS = {
     "error_map": 7,
     "evaluation": 7,
     "logs": 7,
+    "motion_search": 7,
     "report": 7,
     "run_state": 7,
     "sequences": 7,

@@ -7,6 +7,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 from launcher import run_script
+from safetensors.torch import load_file
 
 TINY = (
     "data.resolution=24",
@@ -180,6 +181,26 @@ def test_checkpoint_that_does_not_fit_is_refused(trained, tmp_path):
     assert done.returncode == 2
     assert "model.safetensors" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_motion_is_searched_for_after_training_where_volumes_remember(tmp_path):
+    arguments = (
+        "train", "experiment=flow", "data=synthetic", *TINY, "field.space_time.waits=false",
+        "motion_search.num_steps=2", "motion_search.num_rays=200", "out_dir=run",
+    )  # fmt: skip
+    done = run_script(*arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "remaining motion: none found in " in done.stdout  # by two steps
+    weights = load_file(tmp_path / "run" / "model.safetensors")
+    assert not weights["field.found_remaining"]
+    done = run_script("train", "resume=true", "out_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "finished before, nothing to do" in done.stdout
+    assert "remaining motion" not in done.stdout
+    # A run that was killed before its weights were written searches when it goes on.
+    (tmp_path / "run" / "training.json").unlink()
+    done = run_script("train", "resume=true", "out_dir=run", cwd=tmp_path)
+    assert "remaining motion: none found in " in done.stdout
 
 
 def test_tracks_of_a_flow_are_followed_drawn_and_measured(tmp_path):

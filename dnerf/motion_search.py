@@ -1,0 +1,285 @@
+"""Motion read off a trained field: where what canonical space holds goes, of which the deformation does not know.
+
+A field whose space-time volumes have joined (`dnerf.fields.SpaceTimeVolumes`) shows bodies where they are at each time
+without saying that they are the same ones: its pictures are right, its deformation leaves those bodies where they are.
+So a velocity field is sought in canonical space along whose tracks nothing changes.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from dnerf.checks import check_positive
+from dnerf.data.frames import Frames
+from dnerf.deformations import FlowDeformation
+from dnerf.deformations.solvers import fixed_steps
+from dnerf.fields import DeformedField, RadianceField, SpaceTimeVolumes
+from dnerf.optimizers import AdamMuon
+from dnerf.renderer import Renderer
+
+CHUNK = 16384  # rays, and points, at a time
+LOOKING = (0.0, 0.0, 1.0)
+"""Direction in which contents are looked at: one for all, so that highlights stay where they are."""
+
+GROWS = (0.25, 0.9)
+"""Fractions of a search between which the time grows over which points are followed."""
+
+MOST_LEFT = 0.9
+"""Share of the change of contents above which what is left along tracks is no motion found."""
+
+
+@dataclass(frozen=True)
+class FoundMotion:
+    """What a search has come to.
+
+    Args:
+        before: mean squared change of contents between two times, at a place.
+        after: along the tracks that were found.
+    """
+
+    before: float
+    after: float
+
+    @property
+    def is_motion(self) -> bool:
+        """Whether tracks explain some of the change; not if they are not finite."""
+        return self.after < MOST_LEFT * self.before
+
+
+@dataclass(frozen=True)
+class SeenMatter:
+    """Matter that pictures show.
+
+    Args:
+        positions: (N, 3) in canonical space, in world units.
+        times: (N,) in [0, 1].
+    """
+
+    positions: Tensor
+    times: Tensor
+
+
+def has_unknown_motion(renderer: Renderer) -> bool:
+    """Whether the model shows matter of whose motion it does not know: space-time volumes joined, and no search was."""
+    field = renderer.field
+    return isinstance(field, DeformedField) and not field.has_remaining_motion and _remembers(field)
+
+
+def _remembers(field: DeformedField) -> bool:
+    return any(isinstance(part, SpaceTimeVolumes) and part.has_joined for part in field.canonical.modules())
+
+
+class MotionSearch:
+    """Fits the `remaining_motion` of a `DeformedField` to its canonical field, which stays as it is.
+
+    Points of matter that training pixels show, moved at random for there to be edges on both sides, are carried by the
+    velocity from their time t to another time s. What the field holds there and then is compared with what it held:
+    squared differences of opacity (of an interval of `length`) and of colour times opacity. The gradient goes through
+    the carried positions into the velocity alone. The time |s - t| is at most `spans[0]` at first, over which bodies
+    overlap with themselves, and `spans[1]` in the end, over which small errors of the velocity add up.
+
+    A body of one colour may turn about itself without any change: of such turns tracks know nothing.
+
+    Source: constancy of what is seen along its motion, as of optical flow (Horn and Schunck 1981); deviation: of a
+    reconstructed field in three dimensions, over longer and longer times.
+
+    Args:
+        num_steps: of the optimiser.
+        num_points: of each step.
+        num_rays: through random training pixels, where matter is looked for.
+        learning_rate: of the velocity's matrices, which take orthogonalised steps (`AdamMuon`); a quarter of it for
+            its last layer; all falls to a twentieth.
+        spans: of time, see above, in (0, 1].
+        step: longest step in time of the midpoint rule.
+        jitter: standard deviation of random moves, in world units.
+        length: of the interval whose opacity counts, in world units.
+        still_weight: of the squared speed, in (unit of time / world unit)^2: what changes nowhere stays.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(
+        self,
+        num_steps: int = 600,
+        num_points: int = 1024,
+        num_rays: int = 60_000,
+        *,
+        learning_rate: float = 4e-2,
+        spans: Sequence[float] = (0.02, 0.3),
+        step: float = 0.02,
+        jitter: float = 0.04,
+        length: float = 0.05,
+        still_weight: float = 1e-4,
+    ) -> None:
+        for name, value in (
+            ("num_steps", num_steps), ("num_points", num_points), ("num_rays", num_rays), ("step", step),
+            ("learning_rate", learning_rate), ("length", length),
+        ):  # fmt: skip
+            check_positive(name, value)
+        for name, value in (("jitter", jitter), ("still_weight", still_weight)):
+            check_positive(name, value, allow_zero=True)
+        if len(spans) != 2 or not 0 < spans[0] <= spans[1] <= 1:
+            raise ValueError(f"spans must be two times, 0 < first <= last <= 1, got {list(spans)}")
+        self.num_steps = num_steps
+        self.num_points = num_points
+        self.num_rays = num_rays
+        self.learning_rate = learning_rate
+        self.spans = (float(spans[0]), float(spans[1]))
+        self.step = step
+        self.jitter = jitter
+        self.length = length
+        self.still_weight = still_weight
+
+    def __call__(
+        self, renderer: Renderer, frames: Frames, *, seed: int = 0, progress_bar: bool = False
+    ) -> FoundMotion | None:
+        """Search; what is found becomes part of the field's `motion`, what is not is as it was.
+
+        Args:
+            renderer: trained, its field a `DeformedField` with a `remaining_motion` at rest.
+            frames: whose pixels say where matter is.
+            seed: of all randomness.
+            progress_bar: whether to draw one on standard error.
+
+        Returns:
+            What came of it; None if there is nothing to look for: the deformation is all motion there is, since no
+            space-time volumes have joined, or pictures show nothing.
+
+        Raises:
+            ValueError: for a field without a place for what is found.
+        """
+        field = renderer.field
+        flow = field.remaining_motion if isinstance(field, DeformedField) else None
+        if not isinstance(field, DeformedField) or flow is None:
+            raise ValueError("a motion search needs a DeformedField with a remaining_motion, this field has none")
+        if not _remembers(field):
+            return None
+        generator = torch.Generator(renderer.device).manual_seed(seed)
+        at_rest = {name: value.clone() for name, value in flow.state_dict().items()}
+        with _learning_only(flow, renderer):
+            seen = self._seen_matter(renderer, frames.to(renderer.device), generator)
+            if not len(seen.times):
+                return None
+            self._fit(renderer, field.canonical, flow, seen, generator, progress_bar)
+            found = self._judged(renderer, field.canonical, flow, seen, generator)
+        field.set_remaining_motion(found.is_motion)
+        if not found.is_motion:
+            flow.load_state_dict(at_rest)
+        return found
+
+    @torch.no_grad()
+    def _seen_matter(self, renderer: Renderer, frames: Frames, generator: torch.Generator) -> SeenMatter:
+        """Samples of random rays, each kept with the chance of its share in the picture."""
+        device = renderer.device
+        indices = torch.randint(frames.num_pixels, (self.num_rays,), generator=generator, device=device)
+        positions, times = [], []
+        for part in indices.split(CHUNK):
+            rendering = renderer(frames.pixels(part)[0])
+            assert rendering.output is not None
+            assert rendering.weights is not None
+            weights, extras = rendering.weights.reshape(-1), rendering.output.extras
+            kept = torch.rand(weights.shape, generator=generator, device=device) < weights
+            positions.append(extras["canonical_positions"].reshape(-1, 3)[kept])
+            times.append(extras["times"].reshape(-1)[kept])
+        return SeenMatter(torch.cat(positions), torch.cat(times))
+
+    def _fit(
+        self,
+        renderer: Renderer,
+        canonical: RadianceField,
+        flow: FlowDeformation,
+        seen: SeenMatter,
+        generator: torch.Generator,
+        progress_bar: bool,
+    ) -> None:
+        optimizer = AdamMuon.of(
+            flow,
+            {"": self.learning_rate, "*mlp.output": 0.25 * self.learning_rate},
+            orthogonal=["velocity"],
+            betas=(0.9, 0.99),
+            eps=1e-15,
+        )
+        for number in tqdm(range(self.num_steps), desc="motion", disable=not progress_bar, leave=False):
+            progress = number / self.num_steps
+            optimizer.set_rates(0.05**progress)
+            positions, times = self._drawn(seen, self.num_points, generator)
+            ends, span = self._ends(times, progress, generator)
+            with torch.no_grad():
+                before = self._contents(renderer, canonical, positions, times)
+            moved = self._carried(flow, positions, times, ends, span)
+            change = (self._contents(renderer, canonical, moved, ends) - before).square().sum(-1).mean()
+            speed = flow.velocity(positions, times).square().sum(-1).mean()
+            optimizer.zero_grad(set_to_none=True)
+            (change + self.still_weight * speed).backward()
+            optimizer.step()
+
+    def _drawn(self, seen: SeenMatter, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Positions (count, 3) at or near seen matter, and their times (count,)."""
+        chosen = torch.randint(len(seen.times), (count,), generator=generator, device=seen.times.device)
+        moves = torch.randn(count, 3, generator=generator, device=seen.times.device)
+        return seen.positions[chosen] + self.jitter * moves, seen.times[chosen]
+
+    def _ends(self, times: Tensor, progress: float, generator: torch.Generator) -> tuple[Tensor, float]:
+        """Other times (M,), thrown back at 0 and 1, and how far from `times` they are at most."""
+        grown = min(max((progress - GROWS[0]) / (GROWS[1] - GROWS[0]), 0.0), 1.0)
+        span = self.spans[0] * (self.spans[1] / self.spans[0]) ** grown
+        ends = times + span * (2 * torch.rand(len(times), generator=generator, device=times.device) - 1)
+        return 1 - (1 - ends.abs()).abs(), span
+
+    def _carried(self, flow: FlowDeformation, positions: Tensor, times: Tensor, ends: Tensor, span: float) -> Tensor:
+        lengths = ends - times
+
+        def velocity(s: float | Tensor, places: Tensor) -> Tensor:
+            return lengths[:, None] * flow.velocity(places, times + s * lengths)
+
+        return fixed_steps("midpoint", velocity, positions, math.ceil(span / self.step))
+
+    def _contents(self, renderer: Renderer, canonical: RadianceField, positions: Tensor, times: Tensor) -> Tensor:
+        """Opacity, and colour times opacity, (M, 4)."""
+        with renderer.autocast(positions.device):
+            output = canonical(positions, positions.new_tensor(LOOKING).expand_as(positions), times)
+        opacity = -torch.expm1(-self.length * output.density.float())[:, None]
+        return torch.cat([opacity, opacity * output.rgb.float()], dim=-1)
+
+    @torch.no_grad()
+    def _judged(
+        self,
+        renderer: Renderer,
+        canonical: RadianceField,
+        flow: FlowDeformation,
+        seen: SeenMatter,
+        generator: torch.Generator,
+    ) -> FoundMotion:
+        """Change of contents over times up to the longest span, at places and along the flow."""
+        positions, times = self._drawn(seen, CHUNK, generator)
+        ends, span = self._ends(times, 1.0, generator)
+        moved = self._carried(flow, positions, times, ends, span)
+        here = self._contents(renderer, canonical, positions, times)
+        stayed, carried = (
+            float((self._contents(renderer, canonical, places, ends) - here).square().sum(-1).mean())
+            for places in (positions, moved)
+        )
+        return FoundMotion(stayed, carried)
+
+
+@contextmanager
+def _learning_only(part: nn.Module, renderer: Renderer) -> Iterator[None]:
+    """While it lasts the renderer is in evaluation mode, and parameters of that part alone take gradients."""
+    learns = [(parameter, parameter.requires_grad) for parameter in renderer.parameters()]
+    modes = [(module, module.training) for module in renderer.modules()]
+    renderer.eval()
+    renderer.requires_grad_(False)
+    part.requires_grad_(True)
+    try:
+        yield
+    finally:
+        for parameter, does in learns:
+            parameter.requires_grad_(does)
+        for module, mode in modes:
+            module.training = mode
