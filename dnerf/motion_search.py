@@ -6,9 +6,10 @@ So a velocity field is sought in canonical space along whose tracks nothing chan
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +22,9 @@ from dnerf.deformations.solvers import fixed_steps
 from dnerf.fields import DeformedField, RadianceField, SpaceTimeVolumes
 from dnerf.optimizers import AdamMuon
 from dnerf.renderer import Renderer
+
+Contents = Callable[[Tensor, Tensor], Tensor]
+"""What a field holds, (M, 4), at canonical positions (M, 3) and times (M,)."""
 
 CHUNK = 16384  # rays, and points, at a time
 LOOKING = (0.0, 0.0, 1.0)
@@ -161,13 +165,14 @@ class MotionSearch:
         if not _remembers(field):
             return None
         generator = torch.Generator(renderer.device).manual_seed(seed)
+        contents = partial(self._contents, renderer, field.canonical)
         at_rest = {name: value.clone() for name, value in flow.state_dict().items()}
         with _learning_only(flow, renderer):
             seen = self._seen_matter(renderer, frames.to(renderer.device), generator)
             if not len(seen.times):
                 return None
-            self._fit(renderer, field.canonical, flow, seen, generator, progress_bar)
-            found = self._judged(renderer, field.canonical, flow, seen, generator)
+            self._fit(flow, contents, seen, generator, progress_bar=progress_bar)
+            found = self._judged(flow, contents, seen, generator)
         field.set_remaining_motion(found.is_motion)
         if not found.is_motion:
             flow.load_state_dict(at_rest)
@@ -191,11 +196,11 @@ class MotionSearch:
 
     def _fit(
         self,
-        renderer: Renderer,
-        canonical: RadianceField,
         flow: FlowDeformation,
+        contents: Contents,
         seen: SeenMatter,
         generator: torch.Generator,
+        *,
         progress_bar: bool,
     ) -> None:
         optimizer = AdamMuon.of(
@@ -211,9 +216,9 @@ class MotionSearch:
             positions, times = self._drawn(seen, self.num_points, generator)
             ends, span = self._ends(times, progress, generator)
             with torch.no_grad():
-                before = self._contents(renderer, canonical, positions, times)
+                before = contents(positions, times)
             moved = self._carried(flow, positions, times, ends, span)
-            change = (self._contents(renderer, canonical, moved, ends) - before).square().sum(-1).mean()
+            change = (contents(moved, ends) - before).square().sum(-1).mean()
             speed = flow.velocity(positions, times).square().sum(-1).mean()
             optimizer.zero_grad(set_to_none=True)
             (change + self.still_weight * speed).backward()
@@ -249,21 +254,15 @@ class MotionSearch:
 
     @torch.no_grad()
     def _judged(
-        self,
-        renderer: Renderer,
-        canonical: RadianceField,
-        flow: FlowDeformation,
-        seen: SeenMatter,
-        generator: torch.Generator,
+        self, flow: FlowDeformation, contents: Contents, seen: SeenMatter, generator: torch.Generator
     ) -> FoundMotion:
         """Change of contents over times up to the longest span, at places and along the flow."""
         positions, times = self._drawn(seen, CHUNK, generator)
         ends, span = self._ends(times, 1.0, generator)
         moved = self._carried(flow, positions, times, ends, span)
-        here = self._contents(renderer, canonical, positions, times)
+        here = contents(positions, times)
         stayed, carried = (
-            float((self._contents(renderer, canonical, places, ends) - here).square().sum(-1).mean())
-            for places in (positions, moved)
+            float((contents(places, ends) - here).square().sum(-1).mean()) for places in (positions, moved)
         )
         return FoundMotion(stayed, carried)
 

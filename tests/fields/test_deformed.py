@@ -6,8 +6,9 @@ from reference import FormulaField
 from torch import Tensor
 
 from dnerf.compositing import FieldOutput
-from dnerf.deformations import Deformation
-from dnerf.fields import DeformedField, RadianceField
+from dnerf.deformations import Deformation, FlowDeformation
+from dnerf.deformations.velocities import NetworkVelocity
+from dnerf.fields import Baking, DeformedField, GridField, RadianceField
 
 
 class Drift(Deformation):
@@ -79,3 +80,26 @@ def test_samples_of_a_ray_share_evaluations_of_the_deformation_in_training_only(
 def test_a_spacing_that_is_not_positive_is_refused(spacing: float) -> None:
     with pytest.raises(ValueError, match="spacing must be > 0 and finite"):
         DeformedField(Drift(), Gray(), spacing=spacing)
+
+
+def test_motion_is_the_deformation_until_what_remains_is_found() -> None:
+    """It then stays part of fields whose contents are kept for sequences."""
+    torch.manual_seed(0)
+    box = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    flow = FlowDeformation(NetworkVelocity(box, 1, 8, position_frequencies=1, time_frequencies=1), num_steps=2)
+    torch.nn.init.normal_(flow.velocity.mlp.output.weight)
+    canonical = GridField(box, (4,), 2, hidden_features=8)
+    field = DeformedField(Drift(), canonical, baking=Baking(box, 8), remaining_motion=flow)
+    positions, times = torch.rand(20, 3), torch.rand(20)
+    assert not field.has_remaining_motion
+    assert field.motion is field.deformation
+    field.set_remaining_motion(True)
+    moved = flow(Drift()(positions, times), times)
+    assert (moved - Drift()(positions, times)).abs().max() > 1e-3
+    for kept in (field, field.finished()):
+        assert torch.equal(kept.motion(positions, times), moved)
+    assert field.finished() is not field
+    field.set_remaining_motion(False)
+    assert field.finished().motion is field.deformation
+    # What pictures show does not change with it.
+    assert torch.equal(field(positions, positions, times).extras["canonical_positions"], Drift()(positions, times))
