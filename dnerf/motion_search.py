@@ -1,8 +1,8 @@
-"""Motion read off a trained field: where what canonical space holds goes, of which the deformation does not know.
+"""Motion read off a trained field: where what it shows goes, of which its deformation does not know.
 
 A field whose space-time volumes have joined (`dnerf.fields.SpaceTimeVolumes`) shows bodies where they are at each time
 without saying that they are the same ones: its pictures are right, its deformation leaves those bodies where they are.
-So a velocity field is sought in canonical space along whose tracks nothing changes.
+So a velocity field is sought in the world along whose tracks what the field holds stays the same.
 """
 
 import math
@@ -17,14 +17,15 @@ from tqdm import tqdm
 
 from dnerf.checks import check_positive
 from dnerf.data.frames import Frames
-from dnerf.deformations import FlowDeformation
+from dnerf.deformations import Deformation, FlowDeformation
 from dnerf.deformations.solvers import fixed_steps
-from dnerf.fields import DeformedField, RadianceField, SpaceTimeVolumes
+from dnerf.fields import DeformedField, SpaceTimeVolumes
+from dnerf.motion import carry
 from dnerf.optimizers import AdamMuon
 from dnerf.renderer import Renderer
 
 Contents = Callable[[Tensor, Tensor], Tensor]
-"""What a field holds, (M, 4), at canonical positions (M, 3) and times (M,)."""
+"""What a field holds, (M, 4), at positions (M, 3) and times (M,)."""
 
 CHUNK = 16384  # rays, and points, at a time
 LOOKING = (0.0, 0.0, 1.0)
@@ -34,7 +35,7 @@ GROWS = (0.25, 0.9)
 """Fractions of a search between which the time grows over which points are followed."""
 
 MOST_LEFT = 0.9
-"""Share of the change of contents above which what is left along tracks is no motion found."""
+"""Share of the change along the deformation's tracks above which a flow's tracks are none that were found."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +43,17 @@ class FoundMotion:
     """What a search has come to.
 
     Args:
-        before: mean squared change of contents between two times, at a place.
-        after: along the tracks that were found.
+        deformed: mean squared change of contents between two times along the deformation's tracks.
+        carried: along the flow's.
     """
 
-    before: float
-    after: float
+    deformed: float
+    carried: float
 
     @property
     def is_motion(self) -> bool:
-        """Whether tracks explain some of the change; not if they are not finite."""
-        return self.after < MOST_LEFT * self.before
+        """Whether the flow's tracks are the better ones; not if they are not finite."""
+        return self.carried < MOST_LEFT * self.deformed
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class SeenMatter:
     """Matter that pictures show.
 
     Args:
-        positions: (N, 3) in canonical space, in world units.
+        positions: (N, 3) in world units.
         times: (N,) in [0, 1].
     """
 
@@ -71,7 +72,7 @@ class SeenMatter:
 def has_unknown_motion(renderer: Renderer) -> bool:
     """Whether the model shows matter of whose motion it does not know: space-time volumes joined, and no search was."""
     field = renderer.field
-    return isinstance(field, DeformedField) and not field.has_remaining_motion and _remembers(field)
+    return isinstance(field, DeformedField) and not field.has_found_motion and _remembers(field)
 
 
 def _remembers(field: DeformedField) -> bool:
@@ -79,7 +80,7 @@ def _remembers(field: DeformedField) -> bool:
 
 
 class MotionSearch:
-    """Fits the `remaining_motion` of a `DeformedField` to its canonical field, which stays as it is.
+    """Fits the `motion_flow` of a `DeformedField` to what the field holds, which stays as it is.
 
     Points of matter that training pixels show, moved at random for there to be edges on both sides, are carried by the
     velocity from their time t to another time s. What the field holds there and then is compared with what it held:
@@ -143,10 +144,10 @@ class MotionSearch:
     def __call__(
         self, renderer: Renderer, frames: Frames, *, seed: int = 0, progress_bar: bool = False
     ) -> FoundMotion | None:
-        """Search; what is found becomes part of the field's `motion`, what is not is as it was.
+        """Search; what is found becomes the field's `motion`, if nothing is all is as it was.
 
         Args:
-            renderer: trained, its field a `DeformedField` with a `remaining_motion` at rest.
+            renderer: trained, its field a `DeformedField` with a `motion_flow` at rest.
             frames: whose pixels say where matter is.
             seed: of all randomness.
             progress_bar: whether to draw one on standard error.
@@ -159,21 +160,21 @@ class MotionSearch:
             ValueError: for a field without a place for what is found.
         """
         field = renderer.field
-        flow = field.remaining_motion if isinstance(field, DeformedField) else None
+        flow = field.motion_flow if isinstance(field, DeformedField) else None
         if not isinstance(field, DeformedField) or flow is None:
-            raise ValueError("a motion search needs a DeformedField with a remaining_motion, this field has none")
+            raise ValueError("a motion search needs a DeformedField with a motion_flow, this field has none")
         if not _remembers(field):
             return None
         generator = torch.Generator(renderer.device).manual_seed(seed)
-        contents = partial(self._contents, renderer, field.canonical)
+        contents = partial(self._contents, renderer)
         at_rest = {name: value.clone() for name, value in flow.state_dict().items()}
         with _learning_only(flow, renderer):
             seen = self._seen_matter(renderer, frames.to(renderer.device), generator)
             if not len(seen.times):
                 return None
             self._fit(flow, contents, seen, generator, progress_bar=progress_bar)
-            found = self._judged(flow, contents, seen, generator)
-        field.set_remaining_motion(found.is_motion)
+            found = self._judged(field.deformation, flow, contents, seen, generator)
+        field.set_found_motion(found.is_motion)
         if not found.is_motion:
             flow.load_state_dict(at_rest)
         return found
@@ -190,7 +191,7 @@ class MotionSearch:
             assert rendering.weights is not None
             weights, extras = rendering.weights.reshape(-1), rendering.output.extras
             kept = torch.rand(weights.shape, generator=generator, device=device) < weights
-            positions.append(extras["canonical_positions"].reshape(-1, 3)[kept])
+            positions.append(extras["positions"].reshape(-1, 3)[kept])
             times.append(extras["times"].reshape(-1)[kept])
         return SeenMatter(torch.cat(positions), torch.cat(times))
 
@@ -245,26 +246,29 @@ class MotionSearch:
 
         return fixed_steps("midpoint", velocity, positions, math.ceil(span / self.step))
 
-    def _contents(self, renderer: Renderer, canonical: RadianceField, positions: Tensor, times: Tensor) -> Tensor:
+    def _contents(self, renderer: Renderer, positions: Tensor, times: Tensor) -> Tensor:
         """Opacity, and colour times opacity, (M, 4)."""
         with renderer.autocast(positions.device):
-            output = canonical(positions, positions.new_tensor(LOOKING).expand_as(positions), times)
+            output = renderer.field(positions, positions.new_tensor(LOOKING).expand_as(positions), times)
         opacity = -torch.expm1(-self.length * output.density.float())[:, None]
         return torch.cat([opacity, opacity * output.rgb.float()], dim=-1)
 
     @torch.no_grad()
     def _judged(
-        self, flow: FlowDeformation, contents: Contents, seen: SeenMatter, generator: torch.Generator
+        self,
+        deformation: Deformation,
+        flow: FlowDeformation,
+        contents: Contents,
+        seen: SeenMatter,
+        generator: torch.Generator,
     ) -> FoundMotion:
-        """Change of contents over times up to the longest span, at places and along the flow."""
+        """Change of contents over times up to the longest span, along the deformation's tracks and the flow's."""
         positions, times = self._drawn(seen, CHUNK, generator)
         ends, span = self._ends(times, 1.0, generator)
-        moved = self._carried(flow, positions, times, ends, span)
         here = contents(positions, times)
-        stayed, carried = (
-            float((contents(places, ends) - here).square().sum(-1).mean()) for places in (positions, moved)
-        )
-        return FoundMotion(stayed, carried)
+        moved = (carry(deformation, positions, times, ends)[0], self._carried(flow, positions, times, ends, span))
+        changes = (float((contents(places, ends) - here).square().sum(-1).mean()) for places in moved)
+        return FoundMotion(*changes)
 
 
 @contextmanager

@@ -123,16 +123,16 @@ def _fit(
 
 
 def _search_motion(config: DictConfig, renderer: Renderer, frames: Frames) -> None:
-    """Read the motion off the trained field that its deformation does not know of, if that is wanted and there is."""
+    """Read off the trained field the motion that its deformation does not know, if that is wanted and there is."""
     if config.get("motion_search") is None:  # runs of before there was any have no such setting
         return
     start = time.perf_counter()
     found = build(config.motion_search)(renderer, frames, seed=config.seed, progress_bar=config.trainer.progress_bar)
     if found is not None:
-        said = "found" if found.is_motion else "none found"
+        said = "found" if found.is_motion else "nothing found"
         print(
-            f"remaining motion: {said} in {time.perf_counter() - start:.0f} s; what canonical space holds changes by "
-            f"{found.before:.4f}, along its tracks by {found.after:.4f}"
+            f"motion: {said} in {time.perf_counter() - start:.0f} s; what the field holds changes by "
+            f"{found.deformed:.4f} along the deformation's tracks, by {found.carried:.4f} along a flow's"
         )
 
 

@@ -11,7 +11,7 @@ from dnerf.checkpoints import load_weights, save_weights
 from dnerf.compositing import FieldOutput
 from dnerf.data import SyntheticData
 from dnerf.data.frames import Frames
-from dnerf.deformations import ComposedDeformation, FlowDeformation, IdentityDeformation
+from dnerf.deformations import FlowDeformation, IdentityDeformation
 from dnerf.deformations.velocities import NetworkVelocity
 from dnerf.fields import DeformedField, RadianceField, SpaceTimeVolumes
 from dnerf.motion import carry, motion_model
@@ -67,7 +67,7 @@ def a_renderer(*paths: Path, waits: bool = False, canonical: RadianceField | Non
     )
     flow = FlowDeformation(velocity, 0.5, solver="midpoint", num_steps=10)
     canonical = Balls(*paths, waits=waits) if canonical is None else canonical
-    return Renderer(DeformedField(IdentityDeformation(), canonical, remaining_motion=flow), StratifiedSampler(64))
+    return Renderer(DeformedField(IdentityDeformation(), canonical, motion_flow=flow), StratifiedSampler(64))
 
 
 def a_search(**settings: float) -> MotionSearch:
@@ -119,16 +119,16 @@ def test_points_of_a_ball_that_goes_are_carried_along_and_those_at_rest_stay(
 def test_a_search_says_what_it_has_come_to(found: tuple[Renderer, FoundMotion, dict[str, Tensor]]) -> None:
     renderer, result, _ = found
     assert result.is_motion
-    assert result.after < 0.3 * result.before
-    assert renderer.field.has_remaining_motion
+    assert result.carried < 0.3 * result.deformed
+    assert renderer.field.has_found_motion
     assert not has_unknown_motion(renderer)
-    assert isinstance(motion_model(renderer), ComposedDeformation)
+    assert motion_model(renderer) is renderer.field.motion_flow
 
 
 def test_all_but_the_motion_is_as_before(found: tuple[Renderer, FoundMotion, dict[str, Tensor]]) -> None:
     renderer, _, before = found
     for name, value in renderer.state_dict().items():
-        assert torch.equal(value, before[name]) == (not name.startswith(("field.remaining_motion.", "field.found")))
+        assert torch.equal(value, before[name]) == (not name.startswith(("field.motion_flow.", "field.found")))
     assert all(parameter.requires_grad for parameter in renderer.parameters())
     assert all(module.training for module in renderer.modules())
     assert renderer.field.canonical.brightness.grad is None
@@ -150,7 +150,7 @@ def test_the_same_seed_finds_the_same(frames: Frames) -> None:
     for seed in (0, 0, 1):
         renderer = a_renderer(going)
         assert a_search(num_steps=30)(renderer, frames, seed=seed).is_motion
-        states.append(torch.cat([p.detach().flatten() for p in renderer.field.remaining_motion.parameters()]))
+        states.append(torch.cat([p.detach().flatten() for p in renderer.field.motion_flow.parameters()]))
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
 
@@ -171,7 +171,7 @@ def test_nothing_is_found_where_nothing_moves_or_shows(frames: Frames) -> None:
     result = a_search(num_steps=10)(still, frames)
     assert result is not None
     assert not result.is_motion
-    assert not still.field.has_remaining_motion
+    assert not still.field.has_found_motion
     assert all(torch.equal(value, before[name]) for name, value in still.state_dict().items())
     assert a_search(num_steps=10)(empty, frames) is None
 
@@ -193,7 +193,7 @@ def test_a_search_that_ends_in_nan_leaves_the_model_as_it_was(frames: Frames) ->
     search._seen_matter = lambda *_: seen  # type: ignore[method-assign]
     result = search(renderer, frames)
     assert result is not None
-    assert math.isnan(result.after)
+    assert math.isnan(result.carried)
     assert not result.is_motion
     assert all(torch.equal(value, before[name]) for name, value in renderer.state_dict().items())
 
@@ -227,5 +227,5 @@ def test_wrong_settings_are_named(settings: dict[str, float], message: str) -> N
 
 def test_a_field_without_a_place_for_motion_is_refused(frames: Frames) -> None:
     renderer = Renderer(DeformedField(IdentityDeformation(), Balls(going)), StratifiedSampler(8))
-    with pytest.raises(ValueError, match="needs a DeformedField with a remaining_motion, this field has none"):
+    with pytest.raises(ValueError, match="needs a DeformedField with a motion_flow, this field has none"):
         a_search()(renderer, frames)

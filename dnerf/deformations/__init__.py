@@ -2,7 +2,6 @@
 
 from dnerf.deformations.along_rays import deform_along_rays
 from dnerf.deformations.base import Deformation, InvertibleDeformation
-from dnerf.deformations.composed import ComposedDeformation
 from dnerf.deformations.displacement import DisplacementDeformation, SE3Deformation
 from dnerf.deformations.fixed_point import invert
 from dnerf.deformations.flow import FlowDeformation
@@ -14,7 +13,6 @@ from dnerf.deformations.skipping_flow import SkippingFlow
 from dnerf.deformations.solvers import IntegrationError
 
 __all__ = [
-    "ComposedDeformation",
     "Deformation",
     "DisplacementDeformation",
     "Flow",

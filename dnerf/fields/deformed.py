@@ -8,7 +8,6 @@ from torch import Tensor
 from dnerf.checks import check_positive
 from dnerf.compositing import FieldOutput
 from dnerf.deformations import (
-    ComposedDeformation,
     Deformation,
     FlowDeformation,
     FrameLattice,
@@ -33,8 +32,8 @@ class DeformedField(RadianceField):
             None for frames that ask it at every sample.
         spacing: along a ray, in world units, at which the deformation is asked in training, with displacements
             interpolated in between, see `deform_along_rays`; None to ask it at every sample.
-        remaining_motion: place for a flow of what canonical space holds, for fields whose contents go elsewhere without
-            their deformation knowing; pictures do not ask it, see `motion`. None for none.
+        motion_flow: place for a flow that says how matter moves where the deformation does not, for fields that show
+            matter elsewhere without their deformation knowing; pictures do not ask it, see `motion`. None for none.
 
     Raises:
         ValueError: if the spacing is not positive.
@@ -48,7 +47,7 @@ class DeformedField(RadianceField):
         spacing: float | None = None,
         frame_lattice: FrameLattice | None = None,
         baking: Baking | None = None,
-        remaining_motion: FlowDeformation | None = None,
+        motion_flow: FlowDeformation | None = None,
     ) -> None:
         super().__init__()
         if spacing is not None:
@@ -58,28 +57,28 @@ class DeformedField(RadianceField):
         self.canonical = canonical
         self.frame_lattice = frame_lattice
         self.baking = baking
-        self.remaining_motion = remaining_motion
-        self.register_buffer("found_remaining", torch.tensor(False), persistent=remaining_motion is not None)
-        self.found_remaining: Tensor
+        self.motion_flow = motion_flow
+        self.register_buffer("found_motion", torch.tensor(False), persistent=motion_flow is not None)
+        self.found_motion: Tensor
 
     @property
-    def has_remaining_motion(self) -> bool:
-        """Whether the remaining motion has been found (`dnerf.motion_search`)."""
-        return self.remaining_motion is not None and bool(self.found_remaining)
+    def has_found_motion(self) -> bool:
+        """Whether `motion_flow` has been fitted (`dnerf.motion_search`)."""
+        return self.motion_flow is not None and bool(self.found_motion)
 
-    def set_remaining_motion(self, found: bool) -> None:
-        """Say whether it has been found."""
-        self.found_remaining.fill_(found)
+    def set_found_motion(self, found: bool) -> None:
+        """Say whether it has been."""
+        self.found_motion.fill_(found)
 
     @property
     def motion(self) -> Deformation:
         """How matter moves, as a map from the world to one place per piece of matter.
 
-        It is the deformation, followed by the remaining motion where that has been found.
+        It is the deformation, or the flow that has been fitted instead.
         """
-        if self.remaining_motion is None or not self.has_remaining_motion:
-            return self.deformation
-        return ComposedDeformation(self.deformation, self.remaining_motion)
+        if self.motion_flow is not None and self.has_found_motion:
+            return self.motion_flow
+        return self.deformation
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at positions (..., 3) and times (...,)."""
@@ -102,10 +101,8 @@ class DeformedField(RadianceField):
         if self.baking is None or not self.canonical.num_contents:
             return self
         baked = self.baking.bake(self.canonical)
-        field = DeformedField(
-            self.deformation, baked, frame_lattice=self.frame_lattice, remaining_motion=self.remaining_motion
-        )
-        field.set_remaining_motion(self.has_remaining_motion)
+        field = DeformedField(self.deformation, baked, frame_lattice=self.frame_lattice, motion_flow=self.motion_flow)
+        field.set_found_motion(self.has_found_motion)
         return self._like(field)
 
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from dnerf.deformations import (
-    ComposedDeformation,
     Deformation,
     DisplacementDeformation,
     FlowChain,
@@ -51,10 +50,6 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
             name: FlowDeformation(network_velocity(), None, clock="frozen", solver="euler", num_steps=1)
             for name in ("first", "second")
         }
-    ),
-    "one after the other": lambda: ComposedDeformation(
-        FlowDeformation(network_velocity(), None, clock="frozen", solver="euler", num_steps=1),
-        FlowDeformation(network_velocity(), 0.5, num_steps=4),
     ),
     "flow on a lattice": lambda: LatticeFlow(FlowDeformation(network_velocity(), num_steps=2), BOX, 9, 5, pad_to=64),
     "flow that skips": lambda: SkippingFlow(FlowDeformation(network_velocity(), num_steps=4), BOX, 4, pad_to=16),

@@ -82,24 +82,24 @@ def test_a_spacing_that_is_not_positive_is_refused(spacing: float) -> None:
         DeformedField(Drift(), Gray(), spacing=spacing)
 
 
-def test_motion_is_the_deformation_until_what_remains_is_found() -> None:
+def test_motion_is_the_deformation_until_a_flow_is_fitted_instead() -> None:
     """It then stays part of fields whose contents are kept for sequences."""
     torch.manual_seed(0)
     box = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     flow = FlowDeformation(NetworkVelocity(box, 1, 8, position_frequencies=1, time_frequencies=1), num_steps=2)
     torch.nn.init.normal_(flow.velocity.mlp.output.weight)
     canonical = GridField(box, (4,), 2, hidden_features=8)
-    field = DeformedField(Drift(), canonical, baking=Baking(box, 8), remaining_motion=flow)
+    field = DeformedField(Drift(), canonical, baking=Baking(box, 8), motion_flow=flow)
     positions, times = torch.rand(20, 3), torch.rand(20)
-    assert not field.has_remaining_motion
+    assert not field.has_found_motion
     assert field.motion is field.deformation
-    field.set_remaining_motion(True)
-    moved = flow(Drift()(positions, times), times)
+    field.set_found_motion(True)
+    moved = flow(positions, times)
     assert (moved - Drift()(positions, times)).abs().max() > 1e-3
     for kept in (field, field.finished()):
         assert torch.equal(kept.motion(positions, times), moved)
     assert field.finished() is not field
-    field.set_remaining_motion(False)
+    field.set_found_motion(False)
     assert field.finished().motion is field.deformation
     # What pictures show does not change with it.
     assert torch.equal(field(positions, positions, times).extras["canonical_positions"], Drift()(positions, times))

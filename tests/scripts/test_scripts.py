@@ -190,17 +190,17 @@ def test_motion_is_searched_for_after_training_where_volumes_remember(tmp_path):
     )  # fmt: skip
     done = run_script(*arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "remaining motion: none found in " in done.stdout  # by two steps
+    assert "motion: nothing found in " in done.stdout  # by two steps
     weights = load_file(tmp_path / "run" / "model.safetensors")
-    assert not weights["field.found_remaining"]
+    assert not weights["field.found_motion"]
     done = run_script("train", "resume=true", "out_dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "finished before, nothing to do" in done.stdout
-    assert "remaining motion" not in done.stdout
+    assert "motion: " not in done.stdout
     # A run that was killed before its weights were written searches when it goes on.
     (tmp_path / "run" / "training.json").unlink()
     done = run_script("train", "resume=true", "out_dir=run", cwd=tmp_path)
-    assert "remaining motion: none found in " in done.stdout
+    assert "motion: nothing found in " in done.stdout
 
 
 def test_tracks_of_a_flow_are_followed_drawn_and_measured(tmp_path):
