@@ -48,15 +48,20 @@ class MissingMatterCheck:
         begin: progress of training, in [0, 1], from which it is looked at; never before all frames are in.
         end: progress after which it is not looked at any more.
         every: steps between looks.
+        min_steps: before which it is not looked at either: so early no model has found what it will find. A training
+            that is past `end` by then does without volumes.
 
     Raises:
         ValueError: for numbers out of range.
     """
 
-    def __init__(self, share: float = 0.06, *, begin: float = 0.35, end: float = 0.6, every: int = 8) -> None:
+    def __init__(
+        self, share: float = 0.06, *, begin: float = 0.35, end: float = 0.6, every: int = 8, min_steps: int = 200
+    ) -> None:
         check_positive("share", share)
         check_positive("begin", begin, allow_zero=True)
         check_positive("every", every)
+        check_positive("min_steps", min_steps, allow_zero=True)
         if share >= 1:
             raise ValueError(f"share must be in (0, 1), got {share}")
         if not begin < end <= 1:
@@ -65,10 +70,11 @@ class MissingMatterCheck:
         self.begin = begin
         self.end = end
         self.every = every
+        self.min_steps = min_steps
 
     def is_due(self, step: int, progress: float) -> bool:
         """Whether to look after a step, the `step`-th, at that progress; frames that are not in are the caller's."""
-        return step % self.every == 0 and self.begin <= progress <= self.end
+        return step >= self.min_steps and step % self.every == 0 and self.begin <= progress <= self.end
 
     def __call__(self, step: int, model: nn.Module, found: Mapping[str, float]) -> bool:
         """Let volumes of the model join if it lacks too much.

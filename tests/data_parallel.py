@@ -57,7 +57,7 @@ def grid() -> tuple[Renderer, dict[str, Any]]:
     sampler = OccupancySampler(BOX, 0.1, 24, num_slabs=4, update_every=4, num_probes=512, pad_to=1)
     return Renderer(DeformedField(deformation(), canonical), sampler, RandomBackground()), {
         "num_rays": 64, "target_samples": 1500, "error_map": ErrorMap(resolution=8),
-        "missing_matter": MissingMatterCheck(0.01, begin=0.4, every=2),
+        "missing_matter": MissingMatterCheck(0.01, begin=0.4, every=2, min_steps=0),
     }  # fmt: skip
 
 

@@ -97,9 +97,12 @@ def test_a_batch_without_matter_and_a_model_without_volumes_are_left_alone() -> 
 
 
 def test_it_looks_every_so_many_steps_between_two_points() -> None:
-    check = MissingMatterCheck(begin=0.4, end=0.6, every=10)
+    check = MissingMatterCheck(begin=0.4, end=0.6, every=10, min_steps=0)
     due = [step for step in range(1, 101) if check.is_due(step, step / 100)]
     assert due == [40, 50, 60]
+    late = MissingMatterCheck(begin=0.4, end=0.6, every=10, min_steps=55)
+    assert [step for step in range(1, 101) if late.is_due(step, step / 100)] == [60]
+    assert not any(MissingMatterCheck().is_due(step, step / 300) for step in range(1, 199))
 
 
 @pytest.mark.parametrize(
@@ -108,6 +111,7 @@ def test_it_looks_every_so_many_steps_between_two_points() -> None:
         ({"share": 0.0}, "share must be > 0"),
         ({"share": 1.0}, r"share must be in \(0, 1\), got 1.0"),
         ({"every": 0}, "every must be > 0"),
+        ({"min_steps": -1}, "min_steps must be >= 0"),
         ({"begin": 0.6, "end": 0.5}, r"end must be in \(0.6, 1\], above begin, got 0.5"),
         ({"end": 1.1}, "end must be in"),
     ],
@@ -120,7 +124,7 @@ def test_numbers_out_of_range_are_refused(options: dict, message: str) -> None:
 def trainer(**changes: object) -> Trainer:
     options = {
         "num_steps": 24, "num_rays": 128, "target_samples": 512, "log_every": 6, "progress_bar": False,
-        "learning_rates": {"": 1e-2}, "missing_matter": MissingMatterCheck(begin=0.4, every=4),
+        "learning_rates": {"": 1e-2}, "missing_matter": MissingMatterCheck(begin=0.4, every=4, min_steps=0),
     }  # fmt: skip
     return Trainer(**{**options, **changes})  # type: ignore[arg-type]
 
@@ -174,7 +178,7 @@ def test_they_wait_until_all_frames_are_in(frames: Frames) -> None:
 def test_they_go_on_waiting_where_enough_is_shown_and_cost_nothing(frames: Frames) -> None:
     """Then training is, to the last bit, one without the check, with the same field."""
     weights = []
-    for check in (MissingMatterCheck(0.999, begin=0.4, every=4), None):
+    for check in (MissingMatterCheck(0.999, begin=0.4, every=4, min_steps=0), None):
         renderer = a_renderer(density_shift=0.0)
         trainer(missing_matter=check).fit(renderer, frames)
         assert not volumes_of(renderer).has_joined
