@@ -63,7 +63,7 @@ def main(config: DictConfig) -> None:
     print(f"{points.shape[0]} tracks over {len(frames)} frames: {output}, {still}")
     print(f"residual: median {tracks.residuals.median():.2e}, largest {tracks.residuals.max():.2e} world units")
     if has_unknown_motion(renderer):
-        print("note: what space-time volumes show moves as no one knows; train with motion_search=contents to find out")
+        print("note: this model shows matter whose motion it does not know, see motion_search in docs/flow.md")
     model = motion_model(renderer)
     if isinstance(model, Deformation):
         _print_folding(model, tracks)

@@ -58,17 +58,18 @@ class DeformedField(RadianceField):
         self.frame_lattice = frame_lattice
         self.baking = baking
         self.motion_flow = motion_flow
-        self.register_buffer("found_motion", torch.tensor(False), persistent=motion_flow is not None)
-        self.found_motion: Tensor
+        self.register_buffer("found_motion", None if motion_flow is None else torch.tensor(False))
+        self.found_motion: Tensor | None
 
     @property
     def has_found_motion(self) -> bool:
         """Whether `motion_flow` has been fitted (`dnerf.motion_search`)."""
-        return self.motion_flow is not None and bool(self.found_motion)
+        return self.found_motion is not None and bool(self.found_motion)
 
     def set_found_motion(self, found: bool) -> None:
-        """Say whether it has been."""
-        self.found_motion.fill_(found)
+        """Say whether it has been; without a `motion_flow` it has not, and nothing changes."""
+        if self.found_motion is not None:
+            self.found_motion.fill_(found)
 
     @property
     def motion(self) -> Deformation:
