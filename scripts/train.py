@@ -20,6 +20,7 @@ from dnerf.data.source import DataSource
 from dnerf.distributed import Processes, started
 from dnerf.files import write_json
 from dnerf.logs import JsonLinesLog, Previews, TensorBoardLog, tensorboard_writer
+from dnerf.motion_search import MotionSearch
 from dnerf.provenance import commit, hardware
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder
@@ -41,6 +42,8 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     """Build data, model and trainer; train; save weights, logs and scores in the run's folder."""
     data = build(config.data)
     model = _model(config, device)
+    # Runs of before there was any have no such setting.
+    search = None if config.get("motion_search") is None else build(config.motion_search)
     frames = data.frames("train")  # after what can be refused in no time: exact frames are rendered first
     name = processes.from_first(lambda: str(held.enter_context(opened(config))).encode())
     assert name is not None
@@ -70,7 +73,8 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     if resume and _is_scored(folder, config, training):
         print(f"{folder}: finished before, nothing to do")
         return
-    _search_motion(config, renderer, frames)
+    if search is not None:
+        _search_motion(search, config, renderer, frames)
     save_weights(renderer, folder / "model.safetensors")
     write_json(folder / "training.json", training)
     if config.evaluate_split is not None:
@@ -122,12 +126,10 @@ def _fit(
         return found.with_traceback(None)  # which holds the model
 
 
-def _search_motion(config: DictConfig, renderer: Renderer, frames: Frames) -> None:
-    """Read off the trained field the motion that its deformation does not know, if that is wanted and there is."""
-    if config.get("motion_search") is None:  # runs of before there was any have no such setting
-        return
+def _search_motion(search: MotionSearch, config: DictConfig, renderer: Renderer, frames: Frames) -> None:
+    """Read off the trained field the motion that its deformation does not know, if there is any."""
     start = time.perf_counter()
-    found = build(config.motion_search)(renderer, frames, seed=config.seed, progress_bar=config.trainer.progress_bar)
+    found = search(renderer, frames, seed=config.seed, progress_bar=config.trainer.progress_bar)
     if found is not None:
         said = "found" if found.is_motion else "nothing found"
         print(

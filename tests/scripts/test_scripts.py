@@ -203,6 +203,16 @@ def test_motion_is_searched_for_after_training_where_volumes_remember(tmp_path):
     assert "motion: nothing found in " in done.stdout
 
 
+def test_a_wrong_motion_search_is_refused_before_training(tmp_path):
+    done = run_script(
+        "train", "experiment=flow", "data=synthetic", *TINY, "motion_search.spans=[0.3,0.1]", "out_dir=run",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.strip() == "error: spans must be two times, 0 < first <= last <= 1, got [0.3, 0.1]"
+    assert not (tmp_path / "run").exists()
+
+
 def test_tracks_of_a_flow_are_followed_drawn_and_measured(tmp_path):
     done = run_script(
         "train", "experiment=flow", "data=synthetic", "data.train_end=0.5", *TINY, "out_dir=run", cwd=tmp_path
