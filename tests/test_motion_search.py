@@ -125,6 +125,16 @@ def test_a_search_says_what_it_has_come_to(found: tuple[Renderer, FoundMotion, d
     assert motion_model(renderer) is renderer.field.motion_flow
 
 
+@pytest.mark.parametrize(
+    ("deformed", "carried", "better"),
+    [(0.1, 0.089, True), (0.1, 0.091, False), (0.1, 0.2, False), (0.0, 0.0, False), (0.1, math.nan, False)],
+)
+def test_a_flow_is_taken_only_where_it_explains_a_tenth_more_than_the_deformation(
+    deformed: float, carried: float, better: bool
+) -> None:
+    assert FoundMotion(deformed, carried).is_motion == better
+
+
 def test_all_but_the_motion_is_as_before(found: tuple[Renderer, FoundMotion, dict[str, Tensor]]) -> None:
     renderer, _, before = found
     for name, value in renderer.state_dict().items():
