@@ -7,13 +7,7 @@ from torch import Tensor
 
 from dnerf.checks import check_positive
 from dnerf.compositing import FieldOutput
-from dnerf.deformations import (
-    Deformation,
-    FlowDeformation,
-    FrameLattice,
-    IdentityDeformation,
-    deform_along_rays,
-)
+from dnerf.deformations import Deformation, FlowDeformation, FrameLattice, IdentityDeformation, deform_along_rays
 from dnerf.fields.baked import Baking
 from dnerf.fields.base import RadianceField
 
