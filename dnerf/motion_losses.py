@@ -187,7 +187,7 @@ class SteadyMatterLoss(DeformationLoss):
         numbers = torch.arange(len(points.times), dtype=points.times.dtype, device=points.times.device)
         # Spread evenly over all times, whatever the points' directions are.
         others = (points.times + (math.sqrt(2) - 1) * (numbers + 0.5)) % 1
-        if canonical.num_contents:
+        if canonical.num_contents and not canonical.has_changes:
             contents = canonical.contents(points.canonical)
             outputs = [canonical.from_contents(contents, times) for times in (points.times, others)]
         else:

@@ -22,6 +22,8 @@ class FrameTracer:
     by the light of the intervals that only one of them takes for unseen. Where the kernel wants vertices or bricks
     that do not exist yet, they are made.
 
+    What a field adds to its contents (`RadianceField.changes`) is kept on the deformation's lattice.
+
     Args:
         deformation: on its lattice, which it fills.
         canonical: in its bricks, which it makes.
@@ -42,6 +44,8 @@ class FrameTracer:
         log_shift: float,
         stop_transmittance: float,
     ) -> None:
+        if canonical.has_changes:
+            deformation.also_keep(canonical.changes)
         self.deformation = deformation
         self.canonical = canonical
         self.grid = grid

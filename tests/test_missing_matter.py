@@ -141,7 +141,7 @@ def test_they_join_in_training_and_learn_from_then_on(frames: Frames) -> None:
 
     trainer().fit(renderer, frames, callbacks=[look])
     assert seen == [(1, False, True), (6, False, True), (12, True, True), (18, True, False), (24, True, False)]
-    assert renderer.field.canonical.num_contents == 0
+    assert renderer.field.canonical.has_changes
 
 
 def test_rays_drawn_where_pictures_are_wrong_do_not_count(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,7 +184,7 @@ def test_they_go_on_waiting_where_enough_is_shown_and_cost_nothing(frames: Frame
         assert not volumes_of(renderer).has_joined
         weights.append(torch.cat([p.detach().flatten() for p in renderer.parameters()]))
     assert torch.equal(*weights)
-    assert renderer.field.canonical.num_contents == 8
+    assert not renderer.field.canonical.has_changes
 
 
 def test_a_run_that_stopped_after_they_joined_goes_on_bit_for_bit(frames: Frames, tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def test_weights_know_whether_they_have_joined(tmp_path: Path) -> None:
         save_weights(saved, tmp_path / "model.safetensors")
         load_weights(loaded, tmp_path / "model.safetensors")
         assert volumes_of(loaded).has_joined == joins
-        assert (loaded.field.canonical.num_contents == 0) == joins
+        assert loaded.field.canonical.has_changes == joins
     assert "joined" not in SpaceTimeVolumes(BOX).state_dict()
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from dnerf.cameras import Camera, Intrinsics, look_at
 from dnerf.deformations import DisplacementDeformation, FrameLattice
 from dnerf.deformations.frame_lattice import FrozenDeformation
-from dnerf.fields import Baking, DeformedField, GridField, RadianceField
+from dnerf.fields import Baking, DeformedField, GridField, RadianceField, SpaceTimeVolumes
 from dnerf.kernels import use_backend
 from dnerf.rays import Rays
 from dnerf.renderer import Renderer
@@ -22,11 +22,21 @@ CAMERA = Camera(Intrinsics(32, 24, 30.0, 30.0), look_at([0.3, -3.2, 0.8], [0.0, 
 
 
 def model(
-    *, time_terms: int = 3, splits: int = 1, stop: float = 1e-4, box: list | None = None, max_bricks: int = 4096
+    *,
+    time_terms: int = 3,
+    splits: int = 1,
+    stop: float = 1e-4,
+    box: list | None = None,
+    max_bricks: int = 4096,
+    cells: int = 24,
+    brick_cells: int = 32,
+    volumes: SpaceTimeVolumes | None = None,
 ) -> Renderer:
     """A random body in the middle of the box, moved a little, as frames of a sequence see it."""
     torch.manual_seed(0)
-    canonical = GridField(BOX, (4, 9), 4, time_terms=time_terms, hidden_features=16, density_shift=2.0)
+    canonical = GridField(
+        BOX, (4, 9), 4, time_terms=time_terms, hidden_features=16, density_shift=2.0, space_time=volumes
+    )
     deformation = DisplacementDeformation(2, 16, (), position_frequencies=2, time_frequencies=2, canonical_time=None)
     with torch.no_grad():
         canonical.table.mul_(150)
@@ -36,7 +46,7 @@ def model(
         deformation.mlp.output.weight.add_(0.03 * torch.randn_like(deformation.mlp.output.weight))
     field = DeformedField(
         deformation, canonical,
-        frame_lattice=FrameLattice(box or BOX, 24), baking=Baking(BOX, 32, max_bricks=max_bricks),
+        frame_lattice=FrameLattice(box or BOX, cells), baking=Baking(BOX, brick_cells, max_bricks=max_bricks),
     )  # fmt: skip
     sampler = OccupancySampler(
         BOX, 0.03 * splits, 16, num_slabs=4, splits=splits, split_weight=0.02, margin=0, pad_to=64
@@ -169,3 +179,21 @@ def test_it_is_used_only_where_it_shows_the_same() -> None:
         frame_lattice=FrameLattice(BOX, 4),  # type: ignore[union-attr]
     )
     assert FrameTracer.of(field.at_time(0.3), grid, 0.3, 1e-3) is None
+
+
+def test_what_space_time_volumes_add_is_kept_on_the_lattice() -> None:
+    """It is linear between vertices: the error falls with the cells' size, faster where the field is smooth."""
+    torch.manual_seed(0)
+    volumes = SpaceTimeVolumes(BOX, (3,), (2,), num_features=2)
+    for table in volumes.tables:
+        torch.nn.init.normal_(table, std=0.7)
+    waiting = SpaceTimeVolumes(BOX, (3,), (2,), num_features=2, waits=True)
+    with use_backend("reference"):  # asks the field itself
+        exact, without = (picture(model(volumes=x, splits=3))[..., :3] for x in (volumes, waiting))
+    errors = []
+    for cells in (12, 24, 48):
+        renderer = model(volumes=volumes, splits=3, cells=cells, brick_cells=128)
+        with patch.object(GridField, "forward", side_effect=AssertionError):
+            errors.append(float((picture(renderer)[..., :3] - exact).square().mean().sqrt()))
+    assert float((without - exact).square().mean().sqrt()) > 10 * errors[1]
+    assert errors[0] > 2.5 * errors[1] > 6 * errors[2]

@@ -1,7 +1,7 @@
 """A deformation at one time, kept on a lattice: what a whole frame needs of it is computed once."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -11,6 +11,9 @@ from dnerf.deformations.base import Deformation, check_positions_times
 from dnerf.kernels import GridLevels, covered_places, few_nonzero, grid_encode
 
 LEAST_ROWS = 256  # fewer take matrix libraries as long
+
+Additions = Callable[[Tensor, Tensor], Tensor]
+"""Four numbers (M, 4) of canonical positions (M, 3) at times (M,)."""
 
 
 class FrameLattice:
@@ -86,8 +89,19 @@ class FrozenDeformation(Deformation):
         self.levels = GridLevels([[len(x) - 1 for x in self.faces]], 1 << (num_vertices - 1).bit_length())
         self.low = torch.stack([x[0] for x in self.faces])
         self.sides = torch.stack([x[-1] for x in self.faces]) - self.low
+        self.additions: Additions | None = None
         self.displacements = torch.full((num_vertices, 4), torch.nan)  # four, so that rows are aligned
         self.is_known = torch.zeros([len(x) for x in reversed(self.faces)], dtype=torch.bool)
+
+    def also_keep(self, additions: Additions) -> None:
+        """Begin anew, with `displacements` of eight columns: the last four are of a vertex's place in canonical space.
+
+        Args:
+            additions: four numbers of places and times, for whoever reads that table; positions are mapped as before.
+        """
+        self.additions = additions
+        self.displacements = self.displacements.new_full((len(self.displacements), 8), torch.nan)
+        self.is_known.zero_()
 
     @torch.no_grad()
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
@@ -169,7 +183,11 @@ class FrozenDeformation(Deformation):
         padded = torch.cat([places, places[-1:].expand(self._padded(len(places)) - len(places))])
         numbers = reversed(torch.unravel_index(padded, self.is_known.shape))
         vertices = torch.stack([faces[number] for faces, number in zip(self.faces, numbers, strict=True)], dim=-1)
-        displaced = self.deformation(vertices, vertices.new_full((len(vertices),), self.time)) - vertices
-        self.displacements[places] = torch.nn.functional.pad(displaced[: len(places)].float(), (0, 1))
+        times = vertices.new_full((len(vertices),), self.time)
+        canonical = self.deformation(vertices, times)
+        rows = torch.nn.functional.pad((canonical - vertices).float(), (0, 1))
+        if self.additions is not None:
+            rows = torch.cat([rows, self.additions(canonical, times).float()], dim=-1)
+        self.displacements[places] = rows[: len(places)]
         self.is_known.view(-1)[places] = True
         return True

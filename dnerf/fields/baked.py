@@ -61,7 +61,9 @@ class Baking:
 class BakedField(RadianceField):
     """A field seen through a lattice that is filled where positions fall; see `Baking`.
 
-    For rendering: it knows nothing of later changes of the field, and no gradient reaches it.
+    For rendering: it knows nothing of later changes of the field, and no gradient reaches it. Of a field that has more
+    to say than its contents (`has_changes`), whoever reads the bricks adds the `changes`; if it is asked as fields are,
+    the field itself answers.
 
     Args:
         field: whose contents are kept.
@@ -89,9 +91,18 @@ class BakedField(RadianceField):
         """As of the field it stands for."""
         return self.field.num_contents
 
+    @property
+    def has_changes(self) -> bool:
+        """As of the field it stands for."""
+        return self.field.has_changes
+
     def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
         """As the field it stands for."""
         return self.field.from_contents(contents, times)
+
+    def changes(self, positions: Tensor, times: Tensor) -> Tensor:
+        """As the field it stands for."""
+        return self.field.changes(positions, times)
 
     def series_at(self, time: float) -> tuple[Tensor, float] | None:
         """As of the field it stands for."""
@@ -105,6 +116,8 @@ class BakedField(RadianceField):
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and at times (...,)."""
         check_positions_times(positions, times)
+        if self.has_changes:
+            return self.field(positions, directions, times)
         times = times.reshape(-1)[0] if times.numel() and bool((times == times.reshape(-1)[0]).all()) else times
         return self.from_contents(self.contents(positions), times)
 

@@ -45,8 +45,15 @@ class RadianceField(nn.Module, ABC):
         """How many numbers say all about a place, see `contents`; 0 if none do, as where directions matter."""
         return 0
 
+    @property
+    def has_changes(self) -> bool:
+        """Whether contents say all but what `changes` adds to them; False for a field without contents."""
+        return False
+
     def contents(self, positions: Tensor) -> Tensor:
         """All that the field knows of positions (..., 3): numbers (..., C), about linear where the field is smooth.
+
+        All but `changes`, if it has any (`has_changes`).
 
         Raises:
             ValueError: for a field without such numbers (`num_contents` is 0), or positions of another shape.
@@ -55,6 +62,8 @@ class RadianceField(nn.Module, ABC):
 
     def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
         """What `forward` says of places, from their contents (..., C), at times (...,) or one time () for all.
+
+        Without `changes`, if it has any.
 
         Raises:
             ValueError: for a field without contents, or shapes that do not fit.
@@ -66,9 +75,18 @@ class RadianceField(nn.Module, ABC):
 
         Returns:
             Factors w (K,) and a shift s such that density is `exp(min(w . terms + s, 15))` and a colour
-            `sigmoid(w . terms)`; None for a field that shows its contents in another way, or has none.
+            `sigmoid(w . terms)`, `changes` added to the products; None for a field that shows its contents in another
+            way, or has none.
         """
         return None
+
+    def changes(self, positions: Tensor, times: Tensor) -> Tensor:
+        """What is added at positions (..., 3) and times (...,) to what terms sum up to, see `series_at`: (..., 4).
+
+        Raises:
+            ValueError: for a field of which contents say all, or that has none (`has_changes` is False).
+        """
+        raise ValueError(f"{type(self).__name__} has no changes beside its contents (has_changes is False)")
 
     def finished(self) -> "RadianceField":
         """The field to ask once nothing is learnt any more; itself, unless something can be kept between frames."""

@@ -109,9 +109,14 @@ class GridField(RadianceField):
 
     @property
     def num_contents(self) -> int:
-        """The head's outputs; none if it sees times or directions."""
-        sees_more = self.encode_times is not None or self.encode_directions is not None or self._sees_space_time
+        """The head's outputs; none if it sees times, but for `space_time`'s, or directions."""
+        sees_more = self.encode_times is not None or self.encode_directions is not None
         return 0 if sees_more else 4 * self.time_terms
+
+    @property
+    def has_changes(self) -> bool:
+        """Whether the head sees `space_time`, beside contents."""
+        return self._sees_space_time and self.num_contents > 0
 
     @property
     def _sees_space_time(self) -> bool:
@@ -125,7 +130,8 @@ class GridField(RadianceField):
         opened = (len(levels) - 1) * min(progress / self.window_end, 1.0) - levels + 1
         self.window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))
 
-    def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
+    def _features(self, positions: Tensor, times: Tensor | None) -> Tensor:
+        """What the head sees, without `space_time`."""
         unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
         features = grid_encode(unit.reshape(-1, 3), self.table, self.levels)
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
@@ -134,13 +140,16 @@ class GridField(RadianceField):
         if self.encode_times is not None:
             assert times is not None
             features = torch.cat([features, self.encode_times(times[..., None])], dim=-1)
-        if self._sees_space_time:
-            assert times is not None
-            assert self.space_time is not None
-            features = torch.cat([features, self.space_time(positions, times)], dim=-1)
-        elif self.space_time is not None:
-            features = nn.functional.pad(features, (0, self.space_time.out_features))
-        return self.head(features)
+        return features
+
+    def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
+        """The head's outputs; without times, those without `space_time`."""
+        features = self._features(positions, times)
+        if self.space_time is None:
+            return self.head(features)
+        if times is None or not self._sees_space_time:
+            return self.head(nn.functional.pad(features, (0, self.space_time.out_features)))
+        return self.head(torch.cat([features, self.space_time(positions, times)], dim=-1))
 
     def _activated(self, raw: Tensor) -> Tensor:
         return activate_density(raw, self.density_activation, self.density_shift)
@@ -168,7 +177,7 @@ class GridField(RadianceField):
         return self._waves(torch.tensor(time, device=self.orders.device)), self.density_shift
 
     def contents(self, positions: Tensor) -> Tensor:
-        """The head's outputs (..., 4 K) at canonical positions (..., 3)."""
+        """The head's outputs (..., 4 K) at canonical positions (..., 3), `space_time` unseen."""
         if not self.num_contents:
             raise self._without_contents()
         check_last_axis("positions", positions, 3)
@@ -178,6 +187,17 @@ class GridField(RadianceField):
         """Density (...,) and rgb (..., 3) of the head's outputs (..., 4 K) at times (...,), or at one time ()."""
         self._check_contents(contents, times)
         return self._shown(contents, times)
+
+    def changes(self, positions: Tensor, times: Tensor) -> Tensor:
+        """What `space_time` adds at canonical positions (..., 3) and times (...,) to density and colour, before their
+        activations: (..., 4)."""
+        if not self.has_changes:
+            return super().changes(positions, times)
+        check_positions_times(positions, times)
+        assert self.space_time is not None
+        features, seen = self._features(positions, None), self.space_time(positions, times)
+        with_it, without = (self.head(torch.cat([features, x], dim=-1)) for x in (seen, torch.zeros_like(seen)))
+        return self._at(with_it, times) - self._at(without, times)
 
     def _shown(self, series: Tensor, times: Tensor) -> FieldOutput:
         values = self._at(series, times)

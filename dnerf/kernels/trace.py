@@ -28,8 +28,9 @@ class FrameTables:
         occupancy: (Gx, Gy, Gz) bool, cells in which samples are taken.
         skips: (ceil(Gx / 8), ...) uint8, `skip_distances` of it.
         aabb: (2, 3) box that the cells fill, in world units.
-        displacements: (V, 4), of the vertices of a lattice, in world units, x fastest, NaN where they are not known;
-            the fourth number is ignored.
+        displacements: (V, 4) or (V, 8), of the vertices of a lattice, in world units, x fastest, NaN where they are not
+            known; the fourth number is ignored. The last four, if there are eight, are what is added to the sums of
+            terms of the logarithm of density, of red, green and blue.
         is_known: (Lz + 1, Ly + 1, Lx + 1) bool, the vertices of which they are known; V in all.
         low: (3,) lowest corner of that lattice, in world units.
         sides: (3,) of it.
@@ -65,7 +66,7 @@ class FrameTables:
         shapes = {
             "skips": blocks_shape(self.occupancy[None])[1:],
             "aabb": (2, 3),
-            "displacements": (self.is_known.numel(), 4),
+            "displacements": (self.is_known.numel(), 8 if self.displacements.shape[-1:] == (8,) else 4),
             "low": (3,),
             "sides": (3,),
             "bricks": (len(self.bricks), VERTICES, 4 * len(self.waves)),
@@ -109,11 +110,11 @@ def trace(
     """Follow rays front to back through the intervals of `march` (jitter 0), as far as what they need is known.
 
     Of an interval's middle x, the displacement d(x) is interpolated, then the contents at x + d(x), whose terms times
-    `waves` sum up to a, b_1, b_2, b_3: density `exp(min(a + log_shift, 15))`, colour `sigmoid(b)`. They are composited
-    as `composite` does; if intervals are split, those whose weight does not exceed `min_weight` are left out, those
-    up to `split_weight` are composited whole, and the parts of all others are. A ray that needs a vertex or brick that
-    is not known waits at that interval. Not differentiable. It is the chain march, grid_encode, brick_lookup, composite
-    without anything written in between.
+    `waves` sum up, with what the lattice adds at x, to a, b_1, b_2, b_3: density `exp(min(a + log_shift, 15))`, colour
+    `sigmoid(b)`. They are composited as `composite` does; if intervals are split, those whose weight does not exceed
+    `min_weight` are left out, those up to `split_weight` are composited whole, and the parts of all others are. A ray
+    that needs a vertex or brick that is not known waits at that interval. Not differentiable. It is the chain march,
+    grid_encode, brick_lookup, composite without anything written in between.
 
     Args:
         origins: (R, 3), world units.
@@ -180,17 +181,20 @@ def trace_reference(
     shape = torch.tensor(slots.shape, device=near.device)
 
     def look(chosen: Tensor, middles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What chosen rays (n,) find at distances: contents (n, 4 K); whether, or why not (n,); and in which brick."""
+        """What chosen rays (n,) find at distances: sums (n, 4); whether, or why not (n,); and in which brick."""
         points = origins[chosen] + middles[:, None] * directions[chosen]
         unit = (points - low) / sides
-        canonical = points + grid_encode_reference(unit, displacements, levels)[:, :3]
+        interpolated = grid_encode_reference(unit, displacements, levels)
+        canonical = points + interpolated[:, :3]
         places = (canonical - brick_low) * cells_per_unit
         contents, is_found = brick_lookup_reference(places, slots, bricks)
         is_inside = ((places >= 0) & (places <= shape * BRICK)).all(-1)
         why = torch.where(is_found, 0, torch.where(is_inside, LACKS_BRICK, ELSEWHERE))
         why[canonical.isnan().any(-1)] = LACKS_VERTEX
         why[~((unit >= 0) & (unit <= 1)).all(-1)] = ELSEWHERE
-        return contents, why, torch.minimum(places.nan_to_num().long() // BRICK, shape - 1)
+        values = contents.unflatten(-1, (4, -1)) @ waves
+        values = values + interpolated[:, 4:] if displacements.shape[1] > 4 else values
+        return values, why, torch.minimum(places.nan_to_num().long() // BRICK, shape - 1)
 
     def stop(chosen: Tensor, why: Tensor, brick: Tensor) -> Tensor:
         """Let those rays wait or give up that lack something; which do not (n,)."""
@@ -200,13 +204,12 @@ def trace_reference(
         goes_on[chosen[why != 0]] = False
         return why == 0
 
-    def opacities(contents: Tensor, lengths: Tensor) -> Tensor:
-        raw = contents.unflatten(-1, (4, -1))[:, 0] @ waves + log_shift
-        return -torch.expm1(-torch.exp(raw.clamp(max=MOST_LOG_DENSITY)) * lengths)
+    def opacities(values: Tensor, lengths: Tensor) -> Tensor:
+        return -torch.expm1(-torch.exp((values[:, 0] + log_shift).clamp(max=MOST_LOG_DENSITY)) * lengths)
 
-    def add(chosen: Tensor, contents: Tensor, middles: Tensor, lengths: Tensor) -> None:
-        opacity, light = opacities(contents, lengths), states[chosen, 0]
-        seen = torch.cat([torch.sigmoid(contents.unflatten(-1, (4, -1))[:, 1:] @ waves), middles[:, None]], dim=-1)
+    def add(chosen: Tensor, values: Tensor, middles: Tensor, lengths: Tensor) -> None:
+        opacity, light = opacities(values, lengths), states[chosen, 0]
+        seen = torch.cat([torch.sigmoid(values[:, 1:]), middles[:, None]], dim=-1)
         states[chosen, 1:] += (light * opacity)[:, None] * seen
         states[chosen, 0] = light * (1 - opacity)
 
@@ -215,12 +218,12 @@ def trace_reference(
         goes_on = numbers == j
         chosen = goes_on.nonzero()[:, 0]
         first, lengths = starts[chosen, j], ends[chosen, j] - starts[chosen, j]
-        contents, why, brick = look(chosen, 0.5 * (first + ends[chosen, j]))
+        values, why, brick = look(chosen, 0.5 * (first + ends[chosen, j]))
         able = stop(chosen, why, brick)
-        chosen, contents, first, lengths = chosen[able], contents[able], first[able], lengths[able]
-        weights = states[chosen, 0] * opacities(contents, lengths)
+        chosen, values, first, lengths = chosen[able], values[able], first[able], lengths[able]
+        weights = states[chosen, 0] * opacities(values, lengths)
         is_whole = (weights > min_weight) & (weights <= split_weight) if splits > 1 else torch.ones_like(able[able])
-        add(chosen[is_whole], contents[is_whole], (first + 0.5 * lengths)[is_whole], lengths[is_whole])
+        add(chosen[is_whole], values[is_whole], (first + 0.5 * lengths)[is_whole], lengths[is_whole])
         able = ~is_whole & ~(weights <= min_weight)  # NaN is seen
         chosen, first, lengths = chosen[able], first[able], lengths[able] / splits
         if len(chosen):
@@ -229,9 +232,9 @@ def trace_reference(
             lacks = (why != 0).long().argmax(0)  # the first part that lacks something
             each = torch.arange(len(chosen), device=near.device)
             able = stop(chosen, why[lacks, each], torch.stack([brick for _, _, brick in found])[lacks, each])
-            for k, (contents, _, _) in enumerate(found):
+            for k, (values, _, _) in enumerate(found):
                 middles = first + (k + 0.5) * lengths
-                add(chosen[able], contents[able], middles[able], lengths[able])
+                add(chosen[able], values[able], middles[able], lengths[able])
         numbers[goes_on] = torch.where(states[goes_on, 0] > stop_transmittance, j + 1, DONE)
     numbers[(numbers >= 0) & (numbers >= keep.shape[1])] = DONE
 

@@ -177,3 +177,26 @@ def test_points_far_away_are_asked_of_the_deformation(strange: float) -> None:
     x = torch.tensor([[0.1, 0.2, 0.3], [strange, 0.0, 0.0]], dtype=torch.float64)
     moved = FrameLattice(BOX, 16).at_time(Bend(), 0.7)(x, x.new_full((2,), 0.7))
     assert torch.equal(moved[1].nan_to_num(), Bend()(x, x.new_full((2,), 0.7))[1].nan_to_num())
+
+
+def test_other_numbers_are_kept_beside_displacements() -> None:
+    """Of where vertices lie in canonical space; what positions become stays as it was."""
+    deformation, x = Bend(), points(200)
+
+    def additions(canonical: Tensor, times: Tensor) -> Tensor:
+        return torch.cat([canonical.sin(), times[:, None]], dim=-1)
+
+    lattice = FrameLattice(BOX, 12)
+    with torch.no_grad():
+        plain, frozen = lattice.at_time(deformation, 0.3), lattice.at_time(deformation, 0.3)
+        frozen.also_keep(additions)
+        times = torch.full((200,), 0.3, dtype=x.dtype)
+        assert torch.equal(frozen(x, times), plain(x, times))
+    known = frozen.is_known.reshape(-1)
+    rows = frozen.displacements[known]
+    assert torch.equal(rows[:, :4], plain.displacements[known])
+    z, y, x_ = torch.meshgrid(*reversed(frozen.faces), indexing="ij")
+    vertices = torch.stack([x_, y, z], dim=-1).reshape(-1, 3)[known]
+    torch.testing.assert_close(rows[:, 4:7], (vertices + rows[:, :3]).sin(), rtol=0, atol=1e-6)
+    assert (rows[:, 7] == torch.tensor(0.3)).all()
+    assert frozen.displacements[~known].isnan().all()

@@ -10,7 +10,7 @@ from torch import Tensor
 from dnerf.cameras import Camera, Intrinsics, look_at
 from dnerf.compositing import FieldOutput
 from dnerf.deformations import DisplacementDeformation, FrameLattice
-from dnerf.fields import BakedField, Baking, DeformedField, GridField, RadianceField
+from dnerf.fields import BakedField, Baking, DeformedField, GridField, RadianceField, SpaceTimeVolumes
 from dnerf.kernels import use_backend
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
@@ -249,3 +249,20 @@ def test_contents_beyond_half_precision_stay_finite_and_no_number_stays_none() -
     values = Baking(BOX, 16).bake(Extreme()).contents(points(50, dtype=torch.float32))
     assert bool(values[:, :3].isfinite().all())
     assert bool(values[:, 3].isnan().all())
+
+
+def test_a_field_with_more_to_say_answers_itself_and_its_contents_are_kept() -> None:
+    torch.manual_seed(0)
+    volumes = SpaceTimeVolumes(BOX, (4,), (4,), num_features=2)
+    field = GridField(BOX, (8, 16), 4, hidden_features=16, time_terms=2, space_time=volumes)
+    for table in volumes.tables:
+        torch.nn.init.normal_(table)
+    kept, x, times = Baking(BOX, 128).bake(field), points(200, dtype=torch.float32), torch.rand(200)
+    with torch.no_grad():
+        said, output = kept(x, x, times), field(x, x, times)
+        assert torch.equal(said.density, output.density)
+        assert torch.equal(said.rgb, output.rgb)
+        assert torch.equal(kept.changes(x, times), field.changes(x, times))
+        torch.testing.assert_close(kept.contents(x), field.contents(x), rtol=0, atol=2e-3)
+    assert kept.has_changes
+    assert kept.num_bricks > 0

@@ -13,11 +13,13 @@ from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField, Spa
 
 @dataclass(frozen=True)
 class Case:
-    """How to build a small field, whether its colour depends on the viewing direction, how many contents it has."""
+    """How to build a small field, whether its colour depends on the viewing direction, how many contents it has, and
+    whether it has more to say."""
 
     make: Callable[[], RadianceField]
     view_dependent: bool = False
     num_contents: int = 0
+    has_changes: bool = False
 
 
 def small_nerf(view_dependent: bool = False, density_activation: str = "softplus") -> NeRFField:
@@ -54,7 +56,7 @@ FIELDS = {
     "grid": Case(small_grid, num_contents=4),
     "grid, changing": Case(lambda: small_grid(time_terms=3), num_contents=12),
     "grid, changing and view-dependent": Case(lambda: small_grid(view_degree=2, time_terms=3), True),
-    "grid, space-time": Case(small_space_time),
+    "grid, space-time": Case(small_space_time, num_contents=12, has_changes=True),
     "grid, space-time and view-dependent": Case(lambda: small_space_time(2), True),
     "grid, timed and view-dependent": Case(lambda: small_grid(time_frequencies=3, view_degree=2), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
@@ -235,6 +237,7 @@ def test_contents_say_all_that_the_field_says(name: str) -> None:
     field = trained(name)
     positions, directions, times = some_points(4, 9)
     assert field.num_contents == FIELDS[name].num_contents
+    assert field.has_changes == FIELDS[name].has_changes
     if not field.num_contents:
         for ask in (lambda: field.contents(positions), lambda: field.from_contents(positions, times)):
             with pytest.raises(ValueError, match="has no contents"):
@@ -242,6 +245,8 @@ def test_contents_say_all_that_the_field_says(name: str) -> None:
         return
     contents = field.contents(positions)
     assert contents.shape == (4, 9, field.num_contents)
+    if field.has_changes:
+        return
     said, output = field.from_contents(contents, times), field(positions, directions, times)
     assert torch.equal(said.density, output.density)
     assert torch.equal(said.rgb, output.rgb)
@@ -271,7 +276,19 @@ def test_contents_add_up_as_the_field_says(name: str) -> None:
         return
     positions, directions, _ = some_points(4, 9)
     waves, shift = series
-    terms = field.contents(positions).unflatten(-1, (4, len(waves))) @ waves
-    output = field(positions, directions, torch.full((4, 9), 0.3))
+    terms, moments = field.contents(positions).unflatten(-1, (4, len(waves))) @ waves, torch.full((4, 9), 0.3)
+    if field.has_changes:
+        changes = field.changes(positions, moments)
+        assert changes.abs().max() > 1e-3
+        terms = terms + changes
+    output = field(positions, directions, moments)
     torch.testing.assert_close(output.density, torch.exp((terms[..., 0] + shift).clamp(max=15)), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(output.rgb, torch.sigmoid(terms[..., 1:]), rtol=1e-5, atol=1e-6)
+
+
+@every_field
+def test_changes_of_a_field_without_or_of_shapes_that_do_not_fit_are_refused(name: str) -> None:
+    field = trained(name)
+    message = "times must" if field.has_changes else "has no changes beside its contents"
+    with pytest.raises(ValueError, match=message):
+        field.changes(torch.zeros(5, 3), torch.zeros(5, 1))

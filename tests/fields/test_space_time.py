@@ -119,15 +119,17 @@ def test_any_batch_and_dtype(batch: tuple[int, ...], dtype: torch.dtype) -> None
 
 
 def test_the_head_sees_them() -> None:
-    """A fresh field hardly changes with time; one with contents does, and what it is at one place has no name."""
+    """A fresh field hardly changes with time, one with contents does; beside what it holds at a place for all times."""
     field = GridField(BOX, (4,), 2, hidden_features=16, space_time=SpaceTimeVolumes(BOX, (4,), (4,)))
     positions, times = some_places(dtype=torch.float32)
-    assert field.num_contents == 0
+    assert field.has_changes
+    static = field.contents(positions).detach()
     first, later = (field.density(positions, t).detach() for t in (torch.zeros(50), times))
     torch.testing.assert_close(first, later, rtol=0.1, atol=0)
     assert field.space_time is not None
     for table in field.space_time.tables:
         torch.nn.init.normal_(table)
+    assert torch.equal(field.contents(positions), static)
     first, later = (field.density(positions, t).detach() for t in (torch.zeros(50), times))
     assert ((later / first).log().abs() > 0.1).float().mean() > 0.5
     for parameter in (*field.space_time.tables, field.table):

@@ -15,13 +15,13 @@ from .grid_encode import locate, trilinear_weights
 from .launch import BORROWS, FAST
 from .rows import blend_rows, prefetch_row
 
-FOUR = (0, 0, 0, 0)
+NUM_ADDED = 4  # numbers behind the displacement of a lattice's row, if it has them
 GOES_ON = 0  # between what ends a ray and what it may lack
 
 
 @njit(forceinline=True, **BORROWS)
 def find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: int, moved: Any) -> Any:
-    """Find in which row the contents at a distance begin, and the fractions in its cell; or what is lacking."""
+    """Find in which row the contents at a distance begin, the fractions in its cell, what is added; or what lacks."""
     why, (x, y, z), (px, py, pz) = brick_at(middle, course, lattice, contents, moved)
     if why != GOES_ON:
         return why
@@ -33,13 +33,22 @@ def find(middle: Any, course: Any, lattice: Any, contents: Any, found: Any, i: i
     rows, fractions = found
     rows[i] = row
     fractions[i, 0], fractions[i, 1], fractions[i, 2] = px - np.float32(x), py - np.float32(y), pz - np.float32(z)
+    if len(lattice[4]) > NUM_ADDED:
+        for k in range(NUM_ADDED):
+            fractions[i, 3 + k] = moved[4 + k]
     return GOES_ON
+
+
+@njit(forceinline=True, **BORROWS)
+def added(found: Any, i: int, k: int, lattice: Any) -> Any:
+    """What the lattice adds to a sum of terms: k = 0 is density's."""
+    return found[1][i, 3 + k] if len(lattice[4]) > NUM_ADDED else np.float32(0)
 
 
 @njit(forceinline=True, **BORROWS)
 def brick_at(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) -> Any:
     """Whether a distance lies in a brick that exists, or why not; its cell; and the place, in cells."""
-    displacements, is_known, low, sides = lattice
+    displacements, is_known, low, sides, lanes = lattice
     slots, _, brick_low, cells_per_unit = contents[:4]
     is_in, (px, py, pz), (x, y, z), (u, v, w) = place_at(middle, course, is_known, low, sides)
     if not is_in:
@@ -48,7 +57,7 @@ def brick_at(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) 
     a = np.int64(x + lx * (y + ly * z))
     b, c = a + lx, a + lx * ly
     d = c + lx
-    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, FOUR)
+    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, lanes)
     if math.isnan(moved[0]):
         return LACKS_VERTEX, (x, y, z), (px, py, pz)
     px = (px + moved[0] - brick_low[0]) * cells_per_unit
@@ -77,13 +86,13 @@ def place_at(middle: Any, course: Any, is_known: Any, low: Any, sides: Any) -> A
 
 
 @njit(forceinline=True, **BORROWS)
-def log_density_at(found: Any, i: int, contents: Any, values: Any, lanes: Any) -> Any:
+def log_density_at(found: Any, i: int, lattice: Any, contents: Any, values: Any, lanes: Any) -> Any:
     """Look up the contents at a place that was found; the logarithm of their density."""
     rows, fractions = found
     bricks, waves, log_shift = contents[1], contents[4], contents[5]
     weights = corner_weights(fractions[i, 0], fractions[i, 1], fractions[i, 2])
     blend_rows(bricks, corner_rows(rows[i]), weights, values, 0, lanes)
-    raw, most = log_shift + sum_of_terms(values, 0, waves), np.float32(MOST_LOG_DENSITY)
+    raw, most = log_shift + sum_of_terms(values, 0, waves) + added(found, i, 0, lattice), np.float32(MOST_LOG_DENSITY)
     return most if raw > most else raw
 
 

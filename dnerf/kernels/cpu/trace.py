@@ -24,7 +24,7 @@ from .course import (
     ray_ranges,
 )
 from .exponential import sigmoid
-from .frame_lookup import FOUR, GOES_ON, brick_at, find, log_density_at, opacity_of, place_at, sum_of_terms
+from .frame_lookup import GOES_ON, NUM_ADDED, added, brick_at, find, log_density_at, opacity_of, place_at, sum_of_terms
 from .launch import BORROWS, kernel, launch, num_threads
 from .rows import trailing_zeros
 from .tasks import next_task, none_taken
@@ -64,8 +64,9 @@ def trace(
         numbers.numpy(),
         vertices.numpy(),
         wanted.numpy(),
-        (*_scratch(num_threads(), max(SAMPLES_AT_ONCE, splits), bricks.shape[2]), cells_of_workers(num_threads())),
+        _scratch(num_threads(), max(SAMPLES_AT_ONCE, splits), bricks.shape[2], table.shape[1]),
         none_taken(),
+        (0,) * table.shape[1],
         (0,) * bricks.shape[2],
     )  # fmt: skip
     return states, numbers, vertices.view(-1), wanted
@@ -76,14 +77,16 @@ def _faint(min_weight: float, step: float) -> float:
     return math.log(min_weight / step) - 1e-3 if min_weight > 0 else -math.inf
 
 
-def _scratch(num_workers: int, size: int, num_contents: int) -> tuple[np.ndarray, ...]:
-    """Each worker's: ends of intervals; their numbers, rows and parts' rows; fractions; contents; displacement."""
+def _scratch(num_workers: int, size: int, num_contents: int, num_moved: int) -> tuple[np.ndarray, ...]:
+    """Each worker's: ends of intervals; their numbers, rows and parts' rows; fractions and what is added; contents; a
+    row of the lattice; cells."""
     return (
         np.empty((num_workers, size, 2), np.float32),
         np.empty((num_workers, 3, size), np.int64),
-        np.empty((num_workers, 2, size, 3), np.float32),
+        np.empty((num_workers, 2, size, 3 + NUM_ADDED), np.float32),
         np.empty((num_workers, num_contents + LINE), np.float32),
-        np.empty((num_workers, len(FOUR) + LINE), np.float32),
+        np.empty((num_workers, num_moved + LINE), np.float32),
+        cells_of_workers(num_workers),
     )
 
 
@@ -92,7 +95,7 @@ def _scratch(num_workers: int, size: int, num_contents: int) -> tuple[np.ndarray
 def _trace(
     rays: Any,
     grid: Any,
-    lattice: Any,
+    tables: Any,
     contents: Any,
     options: Any,
     states: Any,
@@ -101,16 +104,19 @@ def _trace(
     wanted: Any,
     scratch: Any,
     taken: Any,
+    columns: Any,
     lanes: Any,
 ) -> None:
     num_workers = len(scratch[0])
     origins, directions, near, ranges, counts = rays
     occupancy, shape, skips, bounds, aabb, step = grid
+    displacements, is_known, low, sides = tables
     splits = options[0]
     num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
     for worker in prange(num_workers):
         intervals = scratch[0][worker], scratch[1][worker, 0]
         found, parts = (scratch[1][worker, 1], scratch[2][worker, 0]), (scratch[1][worker, 2], scratch[2][worker, 1])
+        lattice = displacements, is_known, low, sides, columns
         values, moved, cells = scratch[3][worker], scratch[4][worker], scratch[5][worker]
         group = next_task(taken)
         while group < num_groups:
@@ -199,27 +205,27 @@ def _composite(
     spans, numbers = intervals
     for i in range(size):
         start, end = spans[i]
-        log_density = log_density_at(found, i, contents, values, lanes)
+        log_density = log_density_at(found, i, lattice, contents, values, lanes)
         if splits > 1 and log_density <= faint:
             continue
         opacity = opacity_of(log_density, end - start)
         weight = state[0] * opacity
         if splits == 1 or min_weight < weight <= split_weight:
-            _add(state, opacity, np.float32(0.5) * (start + end), values, contents[4])
+            _add(state, opacity, np.float32(0.5) * (start + end), found, i, lattice, values, contents[4])
         elif not weight <= min_weight:  # NaN is seen
             length = (end - start) / np.float32(splits)
             for k in range(splits):
                 if 2 * k + 1 == splits:  # its middle is the interval's
                     parts[0][k] = found[0][i]
-                    for axis in range(3):
-                        parts[1][k, axis] = found[1][i, axis]
+                    for column in range(3 + NUM_ADDED):
+                        parts[1][k, column] = found[1][i, column]
                     continue
                 why = find(_part(start, k, length), course, lattice, contents, parts, k, moved)
                 if why != GOES_ON:
                     return numbers[i], why
             for k in range(splits):
-                opacity = opacity_of(log_density_at(parts, k, contents, values, lanes), length)
-                _add(state, opacity, _part(start, k, length), values, contents[4])
+                opacity = opacity_of(log_density_at(parts, k, lattice, contents, values, lanes), length)
+                _add(state, opacity, _part(start, k, length), parts, k, lattice, values, contents[4])
         if not state[0] > stop_transmittance:
             return numbers[i], DONE
     return 0, GOES_ON
@@ -246,12 +252,13 @@ def _mark_brick(
 
 
 @njit(forceinline=True, **BORROWS)
-def _add(state: Any, opacity: Any, distance: Any, values: Any, waves: Any) -> None:
+def _add(state: Any, opacity: Any, distance: Any, found: Any, i: int, lattice: Any, values: Any, waves: Any) -> None:
     """Composite one interval behind a ray's state."""
     num_terms = len(waves)
     weight = state[0] * opacity
-    for k in range(3):
-        state[1 + k] += weight * sigmoid(sum_of_terms(values, (1 + k) * num_terms, waves))
+    for k in range(1, 4):
+        raw = sum_of_terms(values, k * num_terms, waves) + added(found, i, k, lattice)
+        state[k] += weight * sigmoid(raw)
     state[4] += weight * distance
     state[0] *= np.float32(1) - opacity
 
@@ -269,7 +276,7 @@ def _mark_ahead(
     cells: Any,
 ) -> None:
     """Mark the unknown vertices around a waiting ray's interval and the next ones."""
-    _, is_known, low, sides = lattice
+    is_known, low, sides = lattice[1:4]
     bits = np.uint64(0)
     for _ in range(LOOK_AHEAD):
         if bits == 0:
