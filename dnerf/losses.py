@@ -208,7 +208,7 @@ class HiddenMatterLoss(Loss):
         if places is None:
             return rendering.rgb.new_zeros(())
         with torch.no_grad(), renderer.autocast(seen.device):
-            canonical = field.deformation(*places)
+            canonical = field.deformation(field.carried(*places), places[1])
         is_hidden = self.num_samples - self.last_seen.view(-1)[self._cells(canonical)] > self.memory_samples
         with renderer.autocast(seen.device):
             density = field.canonical.density(canonical, places[1])

@@ -12,7 +12,7 @@ from torch import Tensor
 from dnerf.cameras import Camera
 from dnerf.checks import check_positive, check_shape
 from dnerf.compositing import Rendering
-from dnerf.deformations import Deformation, IdentityDeformation, InvertibleDeformation, invert
+from dnerf.deformations import CarriedDeformation, Deformation, IdentityDeformation, InvertibleDeformation, invert
 from dnerf.fields import DeformedField, RadianceField
 from dnerf.geometry import check_last_axis
 from dnerf.renderer import Renderer
@@ -69,6 +69,11 @@ def carry(
     with torch.autocast(positions.device.type, enabled=False):
         if isinstance(model, AnalyticScene):
             return model.advect(positions, before, after), torch.zeros_like(before)
+        if isinstance(model, CarriedDeformation):
+            home = model.bodies(positions, before)
+            near = None if guess is None else model.bodies(guess, after)
+            moved, residual = carry(model.deformation, home, before, after, guess=near)
+            return model.bodies.inverse(moved, after), residual
         canonical = model(positions, before)
         if not isinstance(model, InvertibleDeformation):
             guess = positions if guess is None else guess

@@ -82,7 +82,7 @@ class DeformationLoss(Loss):
         every = max(1, -(-extras["times"].numel() // self.num_points))
         weights = rendering.weights.detach().reshape(-1)[::every]
         return MotionPoints(
-            positions=extras["positions"].detach().reshape(-1, 3)[::every],
+            positions=extras.get("carried_positions", extras["positions"]).detach().reshape(-1, 3)[::every],
             canonical=extras["canonical_positions"].detach().reshape(-1, 3)[::every],
             times=extras["times"].reshape(-1)[::every],
             shares=weights / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny),

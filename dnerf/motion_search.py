@@ -173,7 +173,7 @@ class MotionSearch:
             if not len(seen.times):
                 return None
             self._fit(flow, contents, seen, generator, progress_bar=progress_bar)
-            found = self._judged(field.deformation, flow, contents, seen, generator)
+            found = self._judged(field.modelled_motion, flow, contents, seen, generator)
         field.set_found_motion(found.is_motion)
         if not found.is_motion:
             flow.load_state_dict(at_rest)

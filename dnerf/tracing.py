@@ -57,7 +57,8 @@ class FrameTracer:
     def of(
         cls, field: RadianceField, grid: MarchGrid | None, time: float, stop_transmittance: float
     ) -> "FrameTracer | None":
-        """A tracer of a frame's field, see `RadianceField.at_time`; None where there is no lattice, brick or kernel.
+        """A tracer of a frame's field, see `RadianceField.at_time`; None where there is no lattice, brick or kernel, or
+        small bodies are carried.
 
         Args:
             field: at that time.
@@ -68,7 +69,8 @@ class FrameTracer:
         if grid is None or not isinstance(field, DeformedField):
             return None
         deformation, canonical = field.deformation, field.canonical
-        if not isinstance(deformation, FrozenDeformation) or not isinstance(canonical, BakedField):
+        carries = field.bodies is not None and field.bodies.num_bodies > 0
+        if carries or not isinstance(deformation, FrozenDeformation) or not isinstance(canonical, BakedField):
             return None
         series = canonical.series_at(time)
         if series is None or grid.aabb.dtype != torch.float32 or choose(grid.aabb) != "numba":

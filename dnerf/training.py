@@ -10,6 +10,7 @@ from torch import nn
 from tqdm import tqdm
 
 from dnerf.backgrounds import RandomBackground
+from dnerf.body_search import BodySearch
 from dnerf.box_check import BoxCheck
 from dnerf.checks import check_choice, check_mapping, check_positive
 from dnerf.data.frames import Frames
@@ -69,6 +70,8 @@ class Trainer:
         error_map: draws a share of the rays where pictures are wrong; None draws all evenly.
         missing_matter: lets waiting space-time volumes of the field join where motion does not explain the pictures;
             None leaves them waiting.
+        body_search: finds small bodies that are too fast for the deformation, once, with what the error map knows; for
+            fields that can carry them. None does not look.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
@@ -101,6 +104,7 @@ class Trainer:
         time_window: TimeWindow | None = None,
         error_map: ErrorMap | None = None,
         missing_matter: MissingMatterCheck | None = None,
+        body_search: BodySearch | None = None,
         log_every: int = 20,
         checkpoint_every: int | None = 1000,
         progress_bar: bool = True,
@@ -123,6 +127,7 @@ class Trainer:
             ("time_window", time_window, TimeWindow),
             ("error_map", error_map, ErrorMap),
             ("missing_matter", missing_matter, MissingMatterCheck),
+            ("body_search", body_search, BodySearch),
         )
         for name, part, kind in kinds:
             if part is not None and not isinstance(part, kind):
@@ -151,6 +156,7 @@ class Trainer:
         self.time_window = time_window
         self.error_map = error_map
         self.missing_matter = missing_matter
+        self.body_search = body_search
         self.progress_bar = progress_bar
         self.recovery = recovery
         self.box_check = box_check
@@ -289,7 +295,13 @@ class Trainer:
         if self.error_map is not None:
             self.error_map.learn(drawn, processes.all_rays(errors, num_rays))
         lacking = {name: scalars.pop(name) for name in (NEEDED, LACKING) if name in scalars}
-        check, all_in = self.missing_matter, self.time_window is None or progress >= self.time_window.end
+        all_in = self.time_window is None or progress >= self.time_window.end
+        search, error_map = self.body_search, self.error_map
+        if search is not None and error_map is not None and all_in and search.is_due(run.step + 1, progress, renderer):
+            found_some = search(run.step + 1, renderer, frames, error_map)
+            if found_some:
+                steps.forget()
+        check = self.missing_matter
         if check is not None and all_in and check.is_due(run.step + 1, progress):
             found = processes.mean({name: float(value) * weight for name, value in lacking.items()})
             if check(run.step + 1, renderer, found):

@@ -20,6 +20,7 @@ FLOORS = {
     "provenance": 0,
     "rays": 0,
     "stopping": 0,
+    "trajectories": 0,
     # 1: one ray at a time.
     "backgrounds": 1,
     "cameras": 1,
@@ -50,6 +51,7 @@ FLOORS = {
     "time_window": 6,
     "visualisation": 6,
     # 7: whole runs.
+    "body_search": 7,
     "box_check": 7,
     "checkpoints": 7,
     "consistency": 7,
@@ -93,6 +95,8 @@ WITHIN_A_FLOOR = {
     ("sequences", "video"),
     ("temporal_evaluation", "evaluation"),
     ("run_state", "checkpoints"),
+    ("training", "body_search"),
+    ("body_search", "error_map"),
     ("training", "box_check"),
     ("training", "distributed"),
     ("training", "error_map"),

@@ -2,6 +2,7 @@
 
 from dnerf.deformations.along_rays import deform_along_rays
 from dnerf.deformations.base import Deformation, InvertibleDeformation
+from dnerf.deformations.carried_bodies import CarriedBodies, CarriedDeformation
 from dnerf.deformations.displacement import DisplacementDeformation, SE3Deformation
 from dnerf.deformations.fixed_point import invert
 from dnerf.deformations.flow import FlowDeformation
@@ -13,6 +14,8 @@ from dnerf.deformations.skipping_flow import SkippingFlow
 from dnerf.deformations.solvers import IntegrationError
 
 __all__ = [
+    "CarriedBodies",
+    "CarriedDeformation",
     "Deformation",
     "DisplacementDeformation",
     "Flow",

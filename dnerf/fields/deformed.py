@@ -7,7 +7,15 @@ from torch import Tensor
 
 from dnerf.checks import check_positive
 from dnerf.compositing import FieldOutput
-from dnerf.deformations import Deformation, FlowDeformation, FrameLattice, IdentityDeformation, deform_along_rays
+from dnerf.deformations import (
+    CarriedBodies,
+    CarriedDeformation,
+    Deformation,
+    FlowDeformation,
+    FrameLattice,
+    IdentityDeformation,
+    deform_along_rays,
+)
 from dnerf.fields.baked import Baking
 from dnerf.fields.base import RadianceField
 
@@ -16,7 +24,8 @@ class DeformedField(RadianceField):
     """The canonical field at deformed positions: (density, rgb)(x, d, t) = canonical(deformation(x, t), d, t).
 
     Viewing directions are not turned by the deformation (as in D-NeRF). Its output carries the extras
-    "canonical_positions" (..., 3), and "positions" (..., 3) and "times" (...,) as they came.
+    "canonical_positions" (..., 3), "positions" (..., 3) and "times" (...,) as they came, and "carried_positions"
+    (..., 3), behind `bodies`, at which the deformation was asked.
 
     Args:
         deformation: world -> canonical.
@@ -28,6 +37,7 @@ class DeformedField(RadianceField):
             interpolated in between, see `deform_along_rays`; None to ask it at every sample.
         motion_flow: place for a flow that says how matter moves where the deformation does not, for fields that show
             matter elsewhere without their deformation knowing; pictures do not ask it, see `motion`. None for none.
+        bodies: what positions meet first: places for small fast bodies, see `dnerf.body_search`. None for none.
 
     Raises:
         ValueError: if the spacing is not positive.
@@ -42,6 +52,7 @@ class DeformedField(RadianceField):
         frame_lattice: FrameLattice | None = None,
         baking: Baking | None = None,
         motion_flow: FlowDeformation | None = None,
+        bodies: CarriedBodies | None = None,
     ) -> None:
         super().__init__()
         if spacing is not None:
@@ -52,6 +63,7 @@ class DeformedField(RadianceField):
         self.frame_lattice = frame_lattice
         self.baking = baking
         self.motion_flow = motion_flow
+        self.bodies = bodies
         self.register_buffer("found_motion", None if motion_flow is None else torch.tensor(False))
         self.found_motion: Tensor | None
 
@@ -73,18 +85,45 @@ class DeformedField(RadianceField):
         """
         if self.motion_flow is not None and self.has_found_motion:
             return self.motion_flow
-        return self.deformation
+        return self.modelled_motion
+
+    @property
+    def modelled_motion(self) -> Deformation:
+        """The deformation, behind the bodies that are carried, if there are any."""
+        if self.bodies is None or not self.bodies.num_bodies:
+            return self.deformation
+        return CarriedDeformation(self.bodies, self.deformation)
+
+    def carried(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Positions (..., 3) at times (...,) as the deformation sees them: small fast bodies are at home."""
+        if self.bodies is None or not self.bodies.num_bodies:
+            return positions
+        return self.bodies(positions, times)
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at positions (..., 3) and times (...,)."""
-        return self.canonical.density(self._deformed(positions, times), times)
+        carried = self.carried(positions, times)
+        return self._shown(self.canonical.density(self._deformed(carried, times), times), carried)
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at positions (..., 3), directions (..., 3) and times (...,)."""
-        canonical_positions = self._deformed(positions, times)
+        carried = self.carried(positions, times)
+        canonical_positions = self._deformed(carried, times)
         output = self.canonical(canonical_positions, directions, times)
-        extras = {"canonical_positions": canonical_positions, "positions": positions, "times": times}
-        return replace(output, extras={**output.extras, **extras})
+        extras = {
+            "canonical_positions": canonical_positions,
+            "carried_positions": carried,
+            "positions": positions,
+            "times": times,
+        }
+        density = self._shown(output.density, carried)
+        return replace(output, density=density, extras={**output.extras, **extras})
+
+    def _shown(self, density: Tensor, carried: Tensor) -> Tensor:
+        """Densities (...,) at carried positions (..., 3): none at the home of a body that is not there."""
+        if self.bodies is None or not self.bodies.num_bodies:
+            return density
+        return torch.where(self.bodies.is_nowhere(carried), 0, density)
 
     def _deformed(self, positions: Tensor, times: Tensor) -> Tensor:
         if self.spacing is None or not self.training or isinstance(self.deformation, IdentityDeformation):
@@ -96,7 +135,9 @@ class DeformedField(RadianceField):
         if self.baking is None or not self.canonical.num_contents:
             return self
         baked = self.baking.bake(self.canonical)
-        field = DeformedField(self.deformation, baked, frame_lattice=self.frame_lattice, motion_flow=self.motion_flow)
+        field = DeformedField(
+            self.deformation, baked, frame_lattice=self.frame_lattice, motion_flow=self.motion_flow, bodies=self.bodies
+        )
         field.set_found_motion(self.has_found_motion)
         return self._like(field)
 
@@ -105,7 +146,7 @@ class DeformedField(RadianceField):
         if self.frame_lattice is None or isinstance(self.deformation, IdentityDeformation):
             return self
         frozen = self.frame_lattice.at_time(self.deformation, time, extent)
-        return self._like(DeformedField(frozen, self.canonical))
+        return self._like(DeformedField(frozen, self.canonical, bodies=self.bodies))
 
     def _like(self, field: "DeformedField") -> "DeformedField":
         """Another field in this one's mode; its parts, which may be shared, keep theirs."""

@@ -42,7 +42,7 @@ def test_field_is_asked_at_canonical_positions_and_the_same_times_and_directions
 def test_canonical_positions_come_with_the_output_and_extras_are_kept() -> None:
     positions, times = torch.randn(8, 3), torch.rand(8)
     extras = DeformedField(Drift(), Gray())(positions, positions, times).extras
-    assert extras.keys() == {"halves", "positions", "times", "canonical_positions"}
+    assert extras.keys() == {"halves", "positions", "carried_positions", "times", "canonical_positions"}
     assert torch.equal(extras["halves"], times / 2)
     assert torch.equal(extras["positions"], positions)
     assert torch.equal(extras["times"], times)

@@ -1,0 +1,144 @@
+"""Small bodies that move by about their own size from frame to frame, each carried along a track of its own."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.checks import check_positive, check_shape
+from dnerf.deformations.base import Deformation, check_positions_times
+
+NOWHERE = 1e4
+"""Coordinate of a track while its body is not there; nothing is shown half as far out or further."""
+
+
+class CarriedBodies(nn.Module):
+    """Exchanges the ball of space around each body, wherever that is at the time, with one at a place of its own.
+
+    A field and a deformation behind it then see a fast body at rest, at its home, which has to be an empty place off
+    all tracks; what is empty there lies around the body instead. At each time the map permutes the points of space: it
+    moves balls as they are and changes nothing else, so it is its own inverse (of several bodies: the exchanges in
+    reverse order). Tracks are learnt: their knots take gradients from samples near the body. While a body is not there,
+    its track is `NOWHERE`, and whoever asks at home is sent there.
+
+    Args:
+        max_bodies: for how many there is room.
+        num_knots: of each track, evenly over times from 0 to 1; positions in between are interpolated linearly.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(self, max_bodies: int = 8, num_knots: int = 101) -> None:
+        super().__init__()
+        check_positive("max_bodies", max_bodies)
+        if num_knots < 2:
+            raise ValueError(f"num_knots must be at least 2, got {num_knots}")
+        self.tracks = nn.Parameter(torch.zeros(max_bodies, num_knots, 3))
+        self.register_buffer("homes", torch.zeros(max_bodies, 3))
+        self.register_buffer("radii", torch.zeros(max_bodies))
+        self.register_buffer("searched", torch.tensor(False))
+        self.homes: Tensor
+        self.radii: Tensor
+        self.searched: Tensor
+        self._recall()
+        self.register_load_state_dict_post_hook(lambda module, _: module._recall())
+
+    def _recall(self) -> None:
+        self._num_bodies = int((self.radii > 0).sum())
+        self._was_searched = bool(self.searched)
+
+    @property
+    def num_bodies(self) -> int:
+        """How many are carried; without waiting for a device."""
+        return self._num_bodies
+
+    @property
+    def was_searched(self) -> bool:
+        """Whether `dnerf.body_search` has looked for them."""
+        return self._was_searched
+
+    def set_searched(self) -> None:
+        """Say that it has."""
+        self.searched.fill_(True)
+        self._recall()
+
+    @property
+    def num_knots(self) -> int:
+        """Of each track."""
+        return self.tracks.shape[1]
+
+    @torch.no_grad()
+    def add(self, track: Tensor, home: Tensor, radius: float) -> None:
+        """Carry one body more.
+
+        Args:
+            track: (num_knots, 3), its centres in world units.
+            home: (3,), the centre of an empty ball, off all tracks.
+            radius: of the balls that are exchanged, in world units.
+
+        Raises:
+            ValueError: if there is no room, for shapes that do not fit, or if the balls meet at a knot.
+        """
+        number = self.num_bodies
+        if number == len(self.radii):
+            raise ValueError(f"there is room for max_bodies = {number} bodies only")
+        check_shape("track", track, (self.num_knots, 3))
+        check_shape("home", home, (3,))
+        check_positive("radius", radius)
+        nearest = float((track - home).norm(dim=-1).amin())
+        if not nearest > 2 * radius:
+            raise ValueError(f"home must be {2 * radius:.3g} away from the track, got {nearest:.3g}")
+        self.tracks[number] = track
+        self.homes[number] = home
+        self.radii[number] = radius
+        self._recall()
+
+    def centers(self, number: int, times: Tensor) -> Tensor:
+        """Where a body's centre is, (..., 3), at times (...,) in [0, 1]."""
+        track = self.tracks[number]
+        places = times.detach().to(track.dtype).clamp(0, 1) * (self.num_knots - 1)
+        before = places.long().clamp_(max=self.num_knots - 2)
+        return torch.lerp(track[before], track[before + 1], (places - before)[..., None])
+
+    @staticmethod
+    def is_nowhere(positions: Tensor) -> Tensor:
+        """Whether positions (..., 3) that `forward` gave are of an absent body's home, (...,) bool."""
+        return positions.abs().amax(-1) > NOWHERE / 2
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Positions (..., 3) at times (...,) with the balls exchanged: bodies are at home."""
+        return self._exchanged(positions, times, range(self.num_bodies))
+
+    def inverse(self, positions: Tensor, times: Tensor) -> Tensor:
+        """World positions (..., 3) at times (...,) of what `forward` gives."""
+        return self._exchanged(positions, times, reversed(range(self.num_bodies)))
+
+    def _exchanged(self, positions: Tensor, times: Tensor, numbers: Iterable[int]) -> Tensor:
+        check_positions_times(positions, times)
+        for number in numbers:
+            way = (self.homes[number] - self.centers(number, times)).to(positions.dtype)
+            with torch.no_grad():
+                from_home = positions - self.homes[number].to(positions.dtype)
+                is_away = (from_home + way).norm(dim=-1, keepdim=True) < self.radii[number]
+                is_home = from_home.norm(dim=-1, keepdim=True) < self.radii[number]
+            positions = positions + (is_away.to(way.dtype) - is_home.to(way.dtype)) * way
+        return positions
+
+
+class CarriedDeformation(Deformation):
+    """A deformation behind carried bodies: how matter moves where there are both. See `dnerf.motion.carry`.
+
+    Args:
+        bodies: which world positions meet first.
+        deformation: of what they see then.
+    """
+
+    def __init__(self, bodies: CarriedBodies, deformation: Deformation) -> None:
+        super().__init__()
+        self.bodies = bodies
+        self.deformation = deformation
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Canonical positions (..., 3) of world positions (..., 3) at times (...,)."""
+        return self.deformation(self.bodies(positions, times), times)

@@ -1,0 +1,243 @@
+"""Paths of small bodies from where single pictures, each of another time and camera, show them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+ALIKE = 0.25  # most that colours of one body's sightings differ
+SIZES = 2.5  # most by which their radii do, as a factor
+WINDOW = 8  # sightings of which a path's next place is foretold
+GAP = 4  # frames in a row without a sighting after which a path ends
+AROUND = (-2, -1, 1, 2)  # frames beside three in a row that have to agree with them, two at least
+MOST_TRIED = 400  # beginnings of paths
+CURVED = 5  # sightings from which on a path is taken for curved
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Something small in one picture.
+
+    Args:
+        time: of the picture.
+        origin: (3,) of the ray through its middle, in world units.
+        direction: (3,), unit.
+        angle: half of its width as the camera sees it, in radians.
+        color: (3,).
+        is_alone: whether nothing else is beside it in the picture.
+    """
+
+    time: float
+    origin: Array
+    direction: Array
+    angle: float
+    color: Array
+    is_alone: bool = True
+
+    @property
+    def across(self) -> Array:
+        """(3, 3), which leaves of a vector what is at right angles to the ray."""
+        return np.eye(3) - np.outer(self.direction, self.direction)
+
+    def miss(self, position: Array) -> float:
+        """Distance of a position (3,) from the ray."""
+        return float(np.linalg.norm(self.across @ (position - self.origin)))
+
+    def radius_at(self, position: Array) -> float:
+        """Of what is that wide at the position's distance; not positive behind the camera."""
+        return float((position - self.origin) @ self.direction) * self.angle
+
+    def is_alike(self, color: Array) -> bool:
+        """Whether it has about that colour."""
+        return bool(np.abs(self.color - color).max() <= ALIKE)
+
+
+@dataclass(frozen=True)
+class Path:
+    """Sightings of one body, one per frame at most.
+
+    Args:
+        sightings: by the frame's number in order of time.
+    """
+
+    sightings: dict[int, Sighting]
+
+    def positions(self, times: Array, *, stiffness: float = 0.1) -> Array:
+        """Where the body is at evenly spaced times (T,): the smooth path that passes its rays most closely, (T, 3).
+
+        Least squares of distances from rays and of third differences; before and after all sightings it goes straight
+        on.
+
+        Args:
+            times: T >= 4, increasing evenly.
+            stiffness: weight of the third differences.
+        """
+        count, step = len(times), times[1] - times[0]
+        matrix = np.zeros((count, 3, count, 3))
+        right = np.zeros((count, 3))
+        for sighting in self.sightings.values():
+            place = float(np.clip((sighting.time - times[0]) / step, 0, count - 1))
+            before = min(int(place), count - 2)
+            shares = {before: before + 1 - place, before + 1: place - before}
+            for (i, a), (j, b) in product(shares.items(), repeat=2):
+                matrix[i, :, j] += a * b * sighting.across
+            for i, a in shares.items():
+                right[i] += a * (sighting.across @ sighting.origin)
+        third, second = (np.diff(np.eye(count), n=n, axis=0) for n in (3, 2))
+        prior = stiffness * third.T @ third + 1e-3 * stiffness * second.T @ second + 1e-9 * np.eye(count)
+        full = matrix.reshape(3 * count, 3 * count) + np.kron(prior, np.eye(3))
+        return np.asarray(np.linalg.solve(full, right.reshape(-1)).reshape(count, 3), dtype=np.float64)
+
+
+def triangulated(sightings: Sequence[Sighting], degree: int, time: float, unit: float) -> Array:
+    """The polynomial in time that passes their rays most closely.
+
+    Source: trajectory triangulation (Avidan and Shashua 2000): three rays of three times determine a straight path
+    of constant speed, if the cameras differ.
+
+    Args:
+        sightings: at least degree + 1.
+        degree: of the polynomial.
+        time: from which its argument counts.
+        unit: of its argument, in time.
+
+    Returns:
+        Coefficients (degree + 1, 3): the first is where it is at `time`.
+    """
+    count = degree + 1
+    matrix, right = np.zeros((count, 3, count, 3)), np.zeros((count, 3))
+    for sighting in sightings:
+        powers = ((sighting.time - time) / unit) ** np.arange(count)
+        matrix += powers[:, None, None, None] * powers[:, None] * sighting.across[:, None]
+        right += powers[:, None] * (sighting.across @ sighting.origin)
+    prior = np.diag([1e-9, 1e-9, *([1e-3] * (count - 2))])  # curves are weakly held back
+    full = matrix.reshape(3 * count, 3 * count) + np.kron(prior, np.eye(3))
+    return np.asarray(np.linalg.solve(full, right.reshape(-1)).reshape(count, 3), dtype=np.float64)
+
+
+class PathSearch:
+    """Finds which sightings, one per frame at most, are of one body.
+
+    Three sightings of three frames next to each other determine a straight path; where two of the frames around agree,
+    it is followed to both sides, foretold by a curve through its latest sightings, as long as they come.
+
+    Args:
+        box: (2, 3) corners of where bodies may be.
+        tolerance: most distance of a foretold place from a ray, in world units.
+        min_sightings: of a path.
+        min_share: of the frames between its first and its last sighting in which it is seen.
+    """
+
+    def __init__(
+        self, box: Sequence[Sequence[float]], tolerance: float, *, min_sightings: int = 8, min_share: float = 0.6
+    ) -> None:
+        self.low, self.high = (np.asarray(corner, dtype=float) for corner in box)
+        self.tolerance = tolerance
+        self.min_sightings = min_sightings
+        self.min_share = min_share
+
+    def __call__(self, frames: Sequence[Sequence[Sighting]], times: Sequence[float]) -> list[Path]:
+        """Paths, none of which shares a sighting with another.
+
+        Args:
+            frames: F times what is seen in a frame, in order of time.
+            times: (F,), increasing.
+        """
+        unit = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+        if unit <= 0:
+            return []
+        used: set[int] = set()
+        paths = []
+        for beginning in self._beginnings(frames, times, unit)[:MOST_TRIED]:
+            if any(id(sighting) in used for sighting in beginning.values()):
+                continue
+            found = self._followed(beginning, frames, times, unit, used)
+            length = max(found) - min(found) + 1
+            if len(found) >= max(self.min_sightings, self.min_share * length):
+                used.update(id(sighting) for sighting in found.values())
+                paths.append(Path(dict(sorted(found.items()))))
+        return paths
+
+    def _beginnings(
+        self, frames: Sequence[Sequence[Sighting]], times: Sequence[float], unit: float
+    ) -> list[dict[int, Sighting]]:
+        """Threes of sightings on straight paths, those first with which most others agree, and most closely."""
+        found: list[tuple[int, float, dict[int, Sighting]]] = []
+        for first in range(len(frames) - 2):
+            for second, third in ((first + 1, first + 2), (first + 1, first + 3), (first + 2, first + 3)):
+                if third >= len(frames):
+                    continue
+                for three in product(frames[first], frames[second], frames[third]):
+                    if not all(a.is_alike(b.color) for a, b in ((three[0], three[1]), (three[0], three[2]))):
+                        continue
+                    line = triangulated(three, 1, times[first], unit)
+                    if not self._is_body(three, line, times[first], unit):
+                        continue
+                    around = [first + n if n < 0 else third + n for n in AROUND]
+                    misses = [
+                        min((s.miss(place) for s in frames[m] if s.is_alike(three[1].color)), default=np.inf)
+                        for m in around
+                        if 0 <= m < len(frames)
+                        for place in [line[0] + line[1] * (times[m] - times[first]) / unit]
+                    ]
+                    near = [miss for miss in misses if miss < 2 * self.tolerance]
+                    if len(near) >= 2:
+                        found.append((-len(near), sum(near), dict(zip((first, second, third), three))))
+        return [three for _, _, three in sorted(found, key=lambda each: each[:2])]
+
+    def _is_body(self, three: Sequence[Sighting], line: Array, time: float, unit: float) -> bool:
+        places = [line[0] + line[1] * (s.time - time) / unit for s in three]
+        radii = [s.radius_at(place) for s, place in zip(three, places)]
+        return all(map(self._is_inside, places)) and min(radii) > 0 and max(radii) < SIZES * min(radii)
+
+    def _is_inside(self, position: Array) -> bool:
+        return bool((position > self.low).all() and (position < self.high).all())
+
+    def _followed(
+        self,
+        beginning: dict[int, Sighting],
+        frames: Sequence[Sequence[Sighting]],
+        times: Sequence[float],
+        unit: float,
+        used: set[int],
+    ) -> dict[int, Sighting]:
+        found = dict(beginning)
+        for direction, number in ((1, max(found)), (-1, min(found))):
+            missed = 0
+            while missed <= GAP and 0 <= number + direction < len(frames):
+                number += direction
+                latest = sorted(found, key=lambda m: abs(m - number))[:WINDOW]
+                known = [found[m] for m in latest]
+                sighting = self._next(
+                    known, [s for s in frames[number] if id(s) not in used], times[number], unit, missed
+                )
+                if sighting is None:
+                    missed += 1
+                else:
+                    found[number], missed = sighting, 0
+        return found
+
+    def _next(
+        self, known: Sequence[Sighting], candidates: Sequence[Sighting], time: float, unit: float, missed: int
+    ) -> Sighting | None:
+        """Which of the candidates at that time goes on from what is known, if any does."""
+        is_curved = len(known) >= CURVED
+        curve = triangulated(known, 2 if is_curved else 1, time, unit)
+        if not self._is_inside(curve[0]):
+            return None
+        color = np.median([s.color for s in known], axis=0)
+        places = [((s.time - time) / unit) ** np.arange(len(curve)) @ curve for s in known]
+        radius = float(np.median([s.radius_at(place) for s, place in zip(known, places)]))
+        tolerance = self.tolerance * (1 + 0.5 * missed) * (1 if is_curved else 2)
+        near = [
+            s
+            for s in candidates
+            if s.is_alike(color)
+            and s.miss(curve[0]) < tolerance
+            and radius / SIZES < s.radius_at(curve[0]) < radius * SIZES
+        ]
+        return min(near, key=lambda s: s.miss(curve[0]), default=None)

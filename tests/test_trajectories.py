@@ -1,0 +1,111 @@
+"""Paths of bodies from rays of single pictures."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dnerf.trajectories import Array, Path, PathSearch, Sighting, triangulated
+
+BOX = [[-1.5] * 3, [1.5] * 3]
+TIMES = np.linspace(0, 1, 100)
+RED, BLUE = np.array([0.9, 0.1, 0.1]), np.array([0.1, 0.2, 0.9])
+
+
+def sighting(
+    time: float, position: Array, generator: np.random.Generator, *, color: Array = RED, noise: float = 0.0
+) -> Sighting:
+    """What a random camera four units away sees of a ball of radius 0.06."""
+    away = generator.normal(size=3)
+    origin = 4 * away / np.linalg.norm(away)
+    seen = position + noise * generator.normal(size=3) - origin
+    distance = float(np.linalg.norm(seen))
+    return Sighting(time, origin, seen / distance, 0.06 / distance, color)
+
+
+def circle(times: Array, turns: float = 2.0, radius: float = 0.96) -> Array:
+    angle = 2 * np.pi * turns * times
+    return radius * np.stack([np.cos(angle), np.sin(angle) * 0.92, np.sin(angle) * 0.39], axis=-1)
+
+
+@given(seed=st.integers(0, 10_000))
+def test_three_rays_of_three_times_determine_a_straight_path(seed: int) -> None:
+    """Closed form, wherever the cameras are."""
+    generator = np.random.default_rng(seed)
+    truth = generator.normal(size=(2, 3)) * [[0.5], [0.05]]
+    sightings = [sighting(t, truth[0] + truth[1] * t / 0.02, generator) for t in (0.0, 0.02, 0.06)]
+    found = triangulated(sightings, 1, 0.0, 0.02)
+    assert max(s.miss(found[0] + found[1] * s.time / 0.02) for s in sightings) < 1e-4
+
+
+def test_a_curved_path_is_found_to_the_weight_that_holds_curves_back() -> None:
+    generator = np.random.default_rng(0)
+    truth = np.array([[0.3, -0.2, 0.1], [0.08, 0.05, -0.04], [0.01, -0.01, 0.005]])
+    times = 0.02 * np.arange(8)
+    sightings = [sighting(t, (t / 0.02) ** np.arange(3) @ truth, generator) for t in times]
+    np.testing.assert_allclose(triangulated(sightings, 2, 0.0, 0.02), truth, atol=2e-3)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_two_bodies_are_followed_among_things_that_are_none(seed: int) -> None:
+    """A third of the sightings missing, four false ones in each frame, the bodies' own 0.005 units off."""
+    generator = np.random.default_rng(seed)
+    paths = {"red": circle(TIMES), "blue": -0.6 * circle(TIMES, turns=1.0)[:, [2, 0, 1]]}
+    frames: list[list[Sighting]] = []
+    for i, time in enumerate(TIMES):
+        seen = [
+            sighting(time, generator.uniform(-1, 1, 3), generator, color=generator.uniform(size=3)) for _ in range(4)
+        ]
+        for name, color in (("red", RED), ("blue", BLUE)):
+            if generator.uniform() < 0.85:
+                seen.append(sighting(time, paths[name][i], generator, color=color, noise=0.005))
+        frames.append(seen)
+    found = PathSearch(BOX, 0.1)(frames, TIMES.tolist())
+    for name, color in (("red", RED), ("blue", BLUE)):
+        own = [path for path in found if all(s.is_alike(color) for s in path.sightings.values())]
+        numbers = sorted(number for path in own for number in path.sightings)
+        assert len(numbers) == len(set(numbers))
+        assert len(numbers) > 0.6 * len(TIMES)
+        for path in own:
+            own_times = np.array(list(path.sightings))
+            misses = np.linalg.norm(path.positions(TIMES)[own_times] - paths[name][own_times], axis=-1)
+            assert np.median(misses) < 0.012
+            assert (misses < 0.06).mean() > 0.85  # a path may end with something that is none
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_nothing_is_found_among_things_that_are_none(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    frames = [[sighting(t, generator.uniform(-1, 1, 3), generator) for _ in range(3)] for t in TIMES]
+    assert PathSearch(BOX, 0.1)(frames, TIMES.tolist()) == []
+
+
+def test_few_frames_or_none_and_frames_of_one_time() -> None:
+    search = PathSearch(BOX, 0.1)
+    assert search([], []) == []
+    generator = np.random.default_rng(0)
+    seen = [[sighting(0.5, np.zeros(3), generator)] for _ in range(20)]
+    assert search(seen[:1], [0.5]) == []
+    assert search(seen, [0.5] * 20) == []
+
+
+def test_a_path_ends_where_it_is_not_seen_for_long() -> None:
+    generator = np.random.default_rng(0)
+    truth = circle(TIMES)
+    frames = [[sighting(t, x, generator)] for t, x in zip(TIMES, truth)]
+    frames[45:55] = [[] for _ in range(10)]
+    found = PathSearch(BOX, 0.1)(frames, TIMES.tolist())
+    assert sorted((min(path.sightings), max(path.sightings)) for path in found) == [(0, 44), (55, 99)]
+
+
+def test_positions_go_straight_on_outside_of_what_is_seen() -> None:
+    generator = np.random.default_rng(0)
+    line = np.outer(TIMES, [0.5, -0.3, 0.2])
+    path = Path({i: sighting(TIMES[i], line[i], generator) for i in range(10, 90)})
+    np.testing.assert_allclose(path.positions(TIMES), line, atol=5e-3)
+
+
+def test_behind_a_camera_nothing_has_a_size() -> None:
+    seen = Sighting(0.0, np.zeros(3), np.array([0.0, 0.0, -1.0]), 0.1, RED)
+    assert seen.radius_at(np.array([0.0, 0.0, 1.0])) < 0 < seen.radius_at(np.array([0.0, 0.0, -1.0]))
+    assert seen.miss(np.array([0.3, 0.4, -7.0])) == pytest.approx(0.5)
