@@ -14,6 +14,7 @@ SIZES = 2.5  # most by which their radii do, as a factor
 WINDOW = 8  # sightings of which a path's next place is foretold
 GAP = 4  # frames in a row without a sighting after which a path ends
 AROUND = (-2, -1, 1, 2)  # frames beside three in a row that have to agree with them, two at least
+MOST_BEGINNING = 4  # sightings of a frame, the first ones that are alone, with which paths begin
 MOST_TRIED = 400  # beginnings of paths
 CURVED = 5  # sightings from which on a path is taken for curved
 
@@ -54,6 +55,28 @@ class Sighting:
     def is_alike(self, color: Array) -> bool:
         """Whether it has about that colour."""
         return bool(np.abs(self.color - color).max() <= ALIKE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """The sightings of a frame: rays and colours, (N, 3) each."""
+
+    origins: Array
+    directions: Array
+    colors: Array
+
+    @classmethod
+    def of(cls, seen: Sequence[Sighting]) -> "_Known":
+        columns = ([getattr(s, name) for s in seen] for name in ("origin", "direction", "color"))
+        return cls(*(np.array(column, dtype=np.float64).reshape(-1, 3) for column in columns))
+
+    def miss(self, position: Array, color: Array) -> float:
+        """Distance of a position (3,) from the nearest ray of about that colour (3,)."""
+        away = position - self.origins
+        along = (away * self.directions).sum(-1, keepdims=True)
+        misses = np.linalg.norm(away - along * self.directions, axis=-1)
+        is_alike = (np.abs(self.colors - color) <= ALIKE).all(-1)
+        return float(misses[is_alike].min(initial=np.inf))
 
 
 @dataclass(frozen=True)
@@ -122,8 +145,9 @@ def triangulated(sightings: Sequence[Sighting], degree: int, time: float, unit: 
 class PathSearch:
     """Finds which sightings, one per frame at most, are of one body.
 
-    Three sightings of three frames next to each other determine a straight path; where two of the frames around agree,
-    it is followed to both sides, foretold by a curve through its latest sightings, as long as they come.
+    Three sightings of three frames next to each other, each alone in its picture, determine a straight path; where two
+    of the frames around agree, it is followed to both sides, foretold by a curve through its latest sightings, as long
+    as they come.
 
     Args:
         box: (2, 3) corners of where bodies may be.
@@ -166,33 +190,51 @@ class PathSearch:
         self, frames: Sequence[Sequence[Sighting]], times: Sequence[float], unit: float
     ) -> list[dict[int, Sighting]]:
         """Threes of sightings on straight paths, those first with which most others agree, and most closely."""
-        found: list[tuple[int, float, dict[int, Sighting]]] = []
+        alone = [[s for s in seen if s.is_alone][:MOST_BEGINNING] for seen in frames]
+        numbers, threes = [], []
         for first in range(len(frames) - 2):
-            for second, third in ((first + 1, first + 2), (first + 1, first + 3), (first + 2, first + 3)):
-                if third >= len(frames):
-                    continue
-                for three in product(frames[first], frames[second], frames[third]):
-                    if not all(a.is_alike(b.color) for a, b in ((three[0], three[1]), (three[0], three[2]))):
-                        continue
-                    line = triangulated(three, 1, times[first], unit)
-                    if not self._is_body(three, line, times[first], unit):
-                        continue
-                    around = [first + n if n < 0 else third + n for n in AROUND]
-                    misses = [
-                        min((s.miss(place) for s in frames[m] if s.is_alike(three[1].color)), default=np.inf)
-                        for m in around
-                        if 0 <= m < len(frames)
-                        for place in [line[0] + line[1] * (times[m] - times[first]) / unit]
-                    ]
-                    near = [miss for miss in misses if miss < 2 * self.tolerance]
-                    if len(near) >= 2:
-                        found.append((-len(near), sum(near), dict(zip((first, second, third), three))))
+            for gaps in ((1, 2), (1, 3), (2, 3)):
+                chosen = (first, first + gaps[0], first + gaps[1])
+                if chosen[2] < len(frames):
+                    some = list(product(*(alone[number] for number in chosen)))
+                    threes += some
+                    numbers += [chosen] * len(some)
+        if not threes:
+            return []
+        moments = np.array(times)[np.array(numbers)]
+        lines, is_body = self._lines(threes, moments, unit)
+        known = [_Known.of(seen) for seen in frames]
+        found: list[tuple[int, float, dict[int, Sighting]]] = []
+        for index in np.flatnonzero(is_body):
+            first, third = numbers[index][0], numbers[index][2]
+            near = []
+            for number in (first + n if n < 0 else third + n for n in AROUND):
+                if 0 <= number < len(frames):
+                    place = lines[index, 0] + lines[index, 1] * (times[number] - times[first]) / unit
+                    near.append(known[number].miss(place, threes[index][1].color))
+            near = [miss for miss in near if miss < 2 * self.tolerance]
+            if len(near) >= 2:
+                found.append((-len(near), sum(near), dict(zip(numbers[index], threes[index]))))
         return [three for _, _, three in sorted(found, key=lambda each: each[:2])]
 
-    def _is_body(self, three: Sequence[Sighting], line: Array, time: float, unit: float) -> bool:
-        places = [line[0] + line[1] * (s.time - time) / unit for s in three]
-        radii = [s.radius_at(place) for s, place in zip(three, places)]
-        return all(map(self._is_inside, places)) and min(radii) > 0 and max(radii) < SIZES * min(radii)
+    def _lines(self, threes: Sequence[Sequence[Sighting]], moments: Array, unit: float) -> tuple[Array, Array]:
+        """Straight paths (N, 2, 3) through threes of moments (N, 3), see `triangulated`; whose are of a body, (N,)."""
+        origins, directions, colors = (
+            np.array([[getattr(s, name) for s in three] for three in threes])
+            for name in ("origin", "direction", "color")
+        )
+        angles = np.array([[s.angle for s in three] for three in threes])
+        across = np.eye(3) - directions[..., None] * directions[..., None, :]
+        powers = ((moments - moments[:, :1]) / unit)[..., None] ** np.arange(2)
+        matrix = np.einsum("nsk,nsl,nsij->nkilj", powers, powers, across).reshape(-1, 6, 6) + 1e-9 * np.eye(6)
+        right = np.einsum("nsk,nsij,nsj->nki", powers, across, origins).reshape(-1, 6, 1)
+        lines = np.linalg.solve(matrix, right).reshape(-1, 2, 3)
+        places = np.einsum("nsk,nki->nsi", powers, lines)
+        radii = ((places - origins) * directions).sum(-1) * angles
+        is_alike = (np.abs(colors[:, 1:] - colors[:, :1]) <= ALIKE).all((-1, -2))
+        is_inside = ((places > self.low) & (places < self.high)).all((-1, -2))
+        is_one_size = (radii.min(-1) > 0) & (radii.max(-1) < SIZES * radii.min(-1))
+        return lines, is_alike & is_inside & is_one_size
 
     def _is_inside(self, position: Array) -> bool:
         return bool((position > self.low).all() and (position < self.high).all())
