@@ -45,6 +45,7 @@ PLANT_RATE = 2e-2  # of Adam's steps, 200 at most
 PLANT_STEPS = 200
 PLANT_DEPTH = 2.3  # logarithm of the density that is planted: about ten for each world unit
 PLANT_LEFT = 0.25  # mean squared difference from it that is near enough
+ROUNDS_AT_END = 8  # of as many points each
 POINTS = 20_000  # on a track, to which a sampler's attention is called
 
 
@@ -341,15 +342,40 @@ class BodySearch:
         """Have the sampler look at the track of the latest body for a while: nothing is there yet."""
         if not isinstance(renderer.sampler, OccupancyGrid):
             return
-        number = bodies.num_bodies - 1
-        times = torch.rand(POINTS, generator=generator).to(renderer.device)
-        directions = torch.nn.functional.normalize(torch.randn(POINTS, 3, generator=generator), dim=-1)
-        places = bodies.radii[number] * (directions * torch.rand(POINTS, 1, generator=generator) ** (1 / 3)).to(times)
-        places = places + bodies.centers(number, times)
-        is_inside = ((places >= self.box[0].to(places)) & (places <= self.box[1].to(places))).all(-1)
-        density = torch.full_like(times, SHOWN * renderer.sampler.threshold)
-        renderer.sampler.observe(places[is_inside], times[is_inside], density[is_inside])
+        places, times = self._along(bodies, bodies.num_bodies - 1, POINTS, generator)
+        renderer.sampler.observe(places, times, torch.full_like(times, SHOWN * renderer.sampler.threshold))
         renderer.sampler.decide()
+
+    @torch.no_grad()
+    def finish(self, renderer: Renderer) -> None:
+        """At the end of training, let the sampler see bodies all along their tracks.
+
+        Training knows them at the times of its frames, and fast ones are in a cell for a moment only.
+        """
+        bodies = bodies_of(renderer)
+        if bodies is None or not isinstance(renderer.sampler, OccupancyGrid):
+            return
+        generator = torch.Generator().manual_seed(0)
+        for number in range(bodies.num_bodies):
+            for _ in range(ROUNDS_AT_END):
+                places, times = self._along(bodies, number, POINTS, generator)
+                with renderer.autocast(places.device):
+                    density = renderer.field.density(places, times)
+                renderer.sampler.observe(places, times, density)
+        if bodies.num_bodies:
+            renderer.sampler.decide()
+
+    def _along(
+        self, bodies: CarriedBodies, number: int, count: int, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Positions (N, 3) in the box, random ones of a body's balls of space, and times (N,); N <= count."""
+        device = bodies.tracks.device
+        times = torch.rand(count, generator=generator).to(device)
+        directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+        unit = torch.rand(count, 1, generator=generator) ** (1 / 3)
+        places = bodies.centers(number, times) + bodies.radii[number] * (directions * unit).to(device)
+        is_inside = ((places >= self.box[0].to(device)) & (places <= self.box[1].to(device))).all(-1)
+        return places[is_inside], times[is_inside]
 
 
 def bodies_of(renderer: Renderer) -> CarriedBodies | None:

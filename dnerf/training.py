@@ -234,6 +234,8 @@ class Trainer:
             renderer.sampler.fix_sizes(None)
         renderer.set_progress(1.0)
         renderer.eval()
+        if self.body_search is not None:
+            self.body_search.finish(renderer)
         if self.box_check is not None and processes.is_first:
             self.box_check.warn(run.step, renderer, frames)
         assert run.record is not None

@@ -117,6 +117,29 @@ def test_homes_are_off_all_tracks_and_the_sampler_looks_along_these(searched: Re
     assert bool(sampler.occupied[slabs, *cells.unbind(-1)].all())
 
 
+def test_at_the_end_pictures_look_all_along_the_tracks(frames: Frames) -> None:
+    """Even where no training sample was: between frames a fast body is elsewhere."""
+    renderer = a_renderer()
+    search = BodySearch(BOX)
+    assert search(300, renderer, frames, wrong_where_matter_is(frames))
+    bodies, sampler = bodies_of(renderer), renderer.sampler
+    assert isinstance(sampler, OccupancySampler)
+    renderer.field.density = lambda positions, times: torch.where(  # type: ignore[method-assign]
+        (positions - bodies.centers(0, times)).norm(dim=-1) < 0.1, 50.0, 0.0
+    )
+    sampler.maxima.zero_()
+    renderer.eval()
+    search.finish(renderer)
+    times = torch.linspace(0.02, 0.98, 400)
+    centers = bodies.centers(0, times).detach()
+    is_there = (centers.abs() < 1.5).all(-1)
+    cells = ((centers[is_there] + 1.5) / 3 * 24).long()
+    looked_into = sampler.looked_into(is_narrow=True)[0]
+    slabs = (times[is_there] * len(looked_into)).long()
+    assert float(looked_into[slabs, *cells.unbind(-1)].float().mean()) > 0.99
+    assert float(looked_into.float().mean()) < 0.1
+
+
 def test_thin_matter_is_planted_at_home_where_nothing_was(searched: Renderer, frames: Frames) -> None:
     """An empty place would stay empty: its density, and with it all gradients, is next to nothing."""
     bodies = bodies_of(searched)
