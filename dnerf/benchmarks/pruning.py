@@ -170,7 +170,10 @@ def _using(renderer: Renderer, setting: Setting) -> Renderer:
     """A renderer of the same model with a setting."""
     field = renderer.field
     if isinstance(field, DeformedField):
-        field = DeformedField(field.deformation, field.canonical, frame_lattice=setting.lattice, baking=setting.baking)
+        field = DeformedField(
+            field.deformation, field.canonical,
+            frame_lattice=setting.lattice, baking=setting.baking, bodies=field.bodies,
+        )  # fmt: skip
     changed = Renderer(
         field if setting.knob in OWN else field.finished(), setting.sampler, renderer.background,
         precision=renderer.precision, stop_transmittance=setting.cut, quadrature=renderer.quadrature,
