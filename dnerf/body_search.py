@@ -8,35 +8,28 @@ from itertools import pairwise
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
 
-from dnerf.backgrounds import parse_color
 from dnerf.checks import as_box, check_positive
 from dnerf.data.frames import Frames
 from dnerf.deformations import CarriedBodies
 from dnerf.deformations.carried_bodies import NOWHERE
-from dnerf.error_map import UNSEEN, ErrorMap
+from dnerf.error_map import ErrorMap
 from dnerf.fields import DeformedField, SpaceTimeVolumes
 from dnerf.renderer import Renderer
 from dnerf.samplers.occupancy_grid import OccupancyGrid
+from dnerf.sightings import small_wrong_things
 from dnerf.trajectories import ALIKE, GAP, Array, Path, PathSearch, Sighting
 
 logger = logging.getLogger(__name__)
 
 LAST = 0.9  # progress, after which what is found cannot be learnt any more
-MATTER = 0.5  # opacity, or difference from the background, from which a pixel shows matter
-MIN_PIXELS = 4  # of the small picture, of a sighting
-MOST_SIGHTINGS = 10  # in a frame
-ROUNDS = 40  # by as many pixels may a sighting be long, the way through its own pixels
-BESIDE = 0.2  # most of the pixels around a sighting that show matter, if it is alone
 ALONE = 0.5  # least of a body's sightings that are
 MOST_MISSED = 0.5  # of its radius, by which half of its rays may pass its path
-LONG = 3.0  # times its width: no body, but an edge
 ROOM = 1.6  # times a body's radius, in which it is carried
+BORDER = 0.02  # and so much more, in world units
 SIMILAR = 1.5  # most by which radii of one body's parts differ, as a factor
 OVERLAP = 4  # sightings of one part of its way within another: at their ends
 FINE = 101  # times at which a path is looked at
-BORDER = 0.02  # and so much more, in world units
 CANDIDATES = 4096  # for a home
 TIMES = 16  # at which it has to be empty
 SHOWN = 10.0  # times the density from which on a sampler looks: until what is at home has grown
@@ -200,57 +193,9 @@ class BodySearch:
 
     def sightings(self, frames: Frames, error_map: ErrorMap) -> list[list[Sighting]]:
         """What small things each frame shows where training's pictures are wrong, largest first."""
-        height, width = frames.images.shape[1:3]
-        side = max(1, round(max(height, width) / self.resolution))
-        rows, columns = height // side, width // side
-        is_wrong = (error_map.errors > self.error) & (error_map.errors < UNSEEN)
-        # A block knows a pixel or two: what is wrong in it may reach into its neighbours.
-        is_wrong = max_pool2d(is_wrong.float(), 3, 1, 1) > 0
-        middles = [((torch.arange(n) + 0.5) * side).long() // error_map.block for n in (rows, columns)]
-        found = []
-        for number in range(len(frames)):
-            image = frames.images[number, : rows * side, : columns * side].float() / 255
-            small = avg_pool2d(image.permute(2, 0, 1)[None], side)[0].permute(1, 2, 0).cpu()
-            matter = _opacity(small, frames) > MATTER
-            wrong = is_wrong[number].cpu()[middles[0]][:, middles[1]] & matter
-            found.append(self._in_frame(frames, number, side, small[..., :3], matter, wrong))
-        return found
-
-    def _in_frame(
-        self, frames: Frames, number: int, side: int, colors: Tensor, matter: Tensor, wrong: Tensor
-    ) -> list[Sighting]:
-        labels = _labels(wrong)
-        numbers, counts = labels[labels > 0].unique(return_counts=True)
-        fits = (counts >= MIN_PIXELS) & (counts <= self.max_share * wrong.numel())
-        largest = counts.masked_fill(~fits, 0).argsort(descending=True, stable=True)[
-            : min(int(fits.sum()), MOST_SIGHTINGS)
-        ]
-        pose = frames.poses[number].double().cpu().numpy()
-        focal_x, focal_y, center_x, center_y = frames.intrinsics.lens
-        found = []
-        for index in largest.tolist():
-            is_it = labels == numbers[index]
-            places = is_it.nonzero().double()
-            middle = places.mean(0)
-            spread = torch.linalg.eigvalsh((places - middle).T @ (places - middle) / len(places))
-            if spread[1] > LONG**2 * spread[0].clamp(min=1 / 12):
-                continue
-            row, column = ((middle + 0.5) * side - 0.5).tolist()
-            direction = np.array([(column - center_x) / focal_x, -(row - center_y) / focal_y, -1.0])
-            length = float(np.linalg.norm(direction))
-            around = (max_pool2d(is_it[None].float(), 5, 1, 2)[0] > 0) & ~is_it
-            color = colors[is_it].median(0).values
-            found.append(
-                Sighting(
-                    time=float(frames.times[number]),
-                    origin=pose[:3, 3],
-                    direction=pose[:3, :3] @ direction / length,
-                    angle=side * (len(places) / np.pi) ** 0.5 / focal_x / length,
-                    color=color.double().numpy(),
-                    is_alone=int((around & matter).sum()) <= BESIDE * int(around.sum()),
-                )
-            )
-        return found
+        return small_wrong_things(
+            frames, error_map, error=self.error, resolution=self.resolution, max_share=self.max_share
+        )
 
     def _fast_ones(self, paths: Sequence[Path]) -> list[FastBody]:
         """Those of them that are too fast, longest first; not parts of something larger, nor what hardly fits."""
@@ -388,22 +333,3 @@ def _at(places: Array, time: float) -> Array:
     number = time * (len(places) - 1)
     before = min(int(number), len(places) - 2)
     return places[before] + (number - before) * (places[before + 1] - places[before])
-
-
-def _opacity(small: Tensor, frames: Frames) -> Tensor:
-    """Of pixels (h, w, 4) or, opaque, (h, w, 3): how much they differ from what is behind them."""
-    if frames.has_alpha:
-        return small[..., 3]
-    behind = parse_color("white" if frames.background is None else frames.background)
-    return (small - small.new_tensor(behind)).abs().amax(-1)
-
-
-def _labels(mask: Tensor) -> Tensor:
-    """Numbers (h, w) of what hangs together in a mask (h, w), corners included; 0 for what is not in it."""
-    labels = torch.arange(1, mask.numel() + 1, dtype=torch.float32).view(1, *mask.shape) * mask
-    for _ in range(ROUNDS):
-        spread = max_pool2d(labels, 3, 1, 1) * mask
-        if torch.equal(spread, labels):
-            break
-        labels = spread
-    return labels[0].long()

@@ -71,7 +71,7 @@ class Trainer:
         missing_matter: lets waiting space-time volumes of the field join where motion does not explain the pictures;
             None leaves them waiting.
         body_search: finds small bodies that are too fast for the deformation, once, with what the error map knows; for
-            fields that can carry them. None does not look.
+            fields that can carry them. None, or no error map, does not look.
         log_every: steps between records.
         checkpoint_every: steps between checkpoints, where they are asked for; None writes one at the end only.
         progress_bar: whether to draw one on standard error.
