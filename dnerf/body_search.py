@@ -166,10 +166,10 @@ class BodySearch:
         bodies.set_searched()
         if any(isinstance(part, SpaceTimeVolumes) and part.has_joined for part in renderer.modules()):
             return False
-        order = frames.times.argsort(stable=True).tolist()
+        times, order = frames.times.sort(stable=True)
         seen = self.sightings(frames, error_map)
         search = PathSearch(self.box.tolist(), self.tolerance * float((self.box[1] - self.box[0]).amax()))
-        paths = search([seen[i] for i in order], frames.times[order].tolist())
+        paths = search([seen[i] for i in order.tolist()], times.tolist())
         found = self._joined(self._fast_ones(paths))
         room = len(bodies.radii) - bodies.num_bodies
         spacing = float(frames.times.unique().diff().median()) if len(found) else 0.0

@@ -257,8 +257,7 @@ class Trainer:
         """What takes steps; it replays them where sizes are fixed, unless processes train together."""
         graphs = None
         if self.graphs and processes.size == 1:
-            if renderer.device.type == "cuda":
-                run.optimizer.make_capturable()
+            run.optimizer.make_capturable()
             graphs = GraphCache(renderer.device, [run.generator], list(renderer.parameters()))
         return Steps(
             model, renderer, frames, run.optimizer, run.generator,

@@ -33,10 +33,14 @@ RED, BLUE = (0.9, 0.2, 0.1), (0.1, 0.2, 0.9)
 NUM_FRAMES = 80
 
 
-@pytest.fixture(scope="module")
-def frames() -> Frames:
+def two_balls() -> Frames:
     bodies = [Body(Ball(0.12), Plain(RED), FAST, 200.0), Body(Ball(0.12), Plain(BLUE), SLOW, 200.0)]
     return SyntheticData(AnalyticScene(bodies, box=BOX), 48, num_train=NUM_FRAMES).frames("train")
+
+
+@pytest.fixture(scope="module")
+def frames() -> Frames:
+    return two_balls()
 
 
 def a_renderer(*, volumes: SpaceTimeVolumes | None = None, bodies: CarriedBodies | None = None) -> Renderer:

@@ -45,6 +45,8 @@ class CarriedBodies(nn.Module):
         self.register_load_state_dict_post_hook(lambda module, _: module._recall())
 
     def _recall(self) -> None:
+        """See how many bodies there are."""
+        self.radii = self.radii.clone()  # elsewhere in memory: recorded graphs of the model are out of date
         self._num_bodies = int((self.radii > 0).sum())
         self._was_searched = bool(self.searched)
 
