@@ -3,12 +3,13 @@
 import torch
 from torch import Tensor
 
+from dnerf.deformations.carried_bodies import CarriedBodies
 from dnerf.deformations.frame_lattice import FrozenDeformation
 from dnerf.fields import DeformedField, RadianceField
 from dnerf.fields.baked import BakedField
 from dnerf.kernels import FrameTables, MarchGrid, few_nonzero, trace
 from dnerf.kernels.backend import choose
-from dnerf.kernels.trace import DONE, NUM_STATES
+from dnerf.kernels.trace import DONE, ELSEWHERE, NUM_STATES
 from dnerf.rays import Rays
 
 VERTICES_PER_RAY = 4  # most to ask around all occupied cells, instead of finding out which of them rays want
@@ -22,7 +23,8 @@ class FrameTracer:
     by the light of the intervals that only one of them takes for unseen. Where the kernel wants vertices or bricks
     that do not exist yet, they are made.
 
-    What a field adds to its contents (`RadianceField.changes`) is kept on the deformation's lattice.
+    What a field adds to its contents (`RadianceField.changes`) is kept on the deformation's lattice. Rays that meet
+    carried bodies are not followed: behind these, places are not where the lattice has them.
 
     Args:
         deformation: on its lattice, which it fills.
@@ -32,6 +34,7 @@ class FrameTracer:
         log_shift: likewise.
         stop_transmittance: a ray ends once so little light is left, and if intervals are split, one that is seen as
             little is left out.
+        bodies: that are carried, or None.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class FrameTracer:
         waves: Tensor,
         log_shift: float,
         stop_transmittance: float,
+        bodies: CarriedBodies | None = None,
     ) -> None:
         if canonical.has_changes:
             deformation.also_keep(canonical.changes)
@@ -52,13 +56,13 @@ class FrameTracer:
         self.waves = waves
         self.log_shift = log_shift
         self.stop_transmittance = stop_transmittance
+        self.bodies = bodies
 
     @classmethod
     def of(
         cls, field: RadianceField, grid: MarchGrid | None, time: float, stop_transmittance: float
     ) -> "FrameTracer | None":
-        """A tracer of a frame's field, see `RadianceField.at_time`; None where there is no lattice, brick or kernel, or
-        small bodies are carried.
+        """A tracer of a frame's field, see `RadianceField.at_time`; None where there is no lattice, brick or kernel.
 
         Args:
             field: at that time.
@@ -69,15 +73,15 @@ class FrameTracer:
         if grid is None or not isinstance(field, DeformedField):
             return None
         deformation, canonical = field.deformation, field.canonical
-        carries = field.bodies is not None and field.bodies.num_bodies > 0
-        if carries or not isinstance(deformation, FrozenDeformation) or not isinstance(canonical, BakedField):
+        if not isinstance(deformation, FrozenDeformation) or not isinstance(canonical, BakedField):
             return None
         series = canonical.series_at(time)
         if series is None or grid.aabb.dtype != torch.float32 or choose(grid.aabb) != "numba":
             return None
         return cls(
-            deformation, canonical, grid, waves=series[0], log_shift=series[1], stop_transmittance=stop_transmittance
-        )
+            deformation, canonical, grid, waves=series[0], log_shift=series[1], stop_transmittance=stop_transmittance,
+            bodies=field.bodies,
+        )  # fmt: skip
 
     @torch.no_grad()
     def __call__(self, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -88,13 +92,15 @@ class FrameTracer:
 
         Returns:
             rgb, depth times opacity, and opacity, (R, 5); and of which rays (R,) that is true. The others left the
-            lattices, or wanted bricks for which there is no room; theirs is 0.
+            lattices, meet carried bodies, or wanted bricks for which there is no room; theirs is 0.
         """
         for part in (self.deformation, self.canonical):
             part.move_to(rays.origins.device)
         states = torch.zeros(len(rays), NUM_STATES, device=rays.origins.device)
         states[:, 0] = 1
         numbers = torch.zeros(len(rays), dtype=torch.int64, device=states.device)
+        if self.bodies is not None and self.bodies.num_bodies:
+            numbers[self.bodies.are_met(rays.origins, rays.directions, self.deformation.time)] = ELSEWHERE
         self._fill_ahead(rays, states, numbers)
         while self.deformation.fill(self._follow(rays, states, numbers)):
             pass
@@ -112,10 +118,11 @@ class FrameTracer:
         if len(around) <= VERTICES_PER_RAY * len(rays):
             self.deformation.fill(around)
             return
-        numbers.fill_(DONE)
-        numbers[::PIONEERS] = 0
+        fresh = numbers == 0
+        is_ahead = fresh & (torch.arange(len(rays), device=states.device) % PIONEERS == 0)
+        numbers[fresh & ~is_ahead] = DONE
         self.deformation.fill(self._follow(rays, states, numbers))
-        numbers[torch.arange(len(rays), device=states.device) % PIONEERS > 0] = 0
+        numbers[fresh & ~is_ahead] = 0
 
     def _follow(self, rays: Rays, states: Tensor, numbers: Tensor) -> Tensor:
         """Take the states and numbers of rays as far as the vertices that are known let them come.

@@ -19,11 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from test_body_search import a_renderer, two_balls, wrong_where_matter_is
 from torch import Tensor
 
 from dnerf.backgrounds import RandomBackground
+from dnerf.body_search import BodySearch
 from dnerf.compositing import Rendering
-from dnerf.data import SyntheticData
+from dnerf.data import Frames, SyntheticData
 from dnerf.deformations import DisplacementDeformation
 from dnerf.distributed import LostProcess, Processes, started
 from dnerf.error_map import ErrorMap
@@ -61,7 +63,22 @@ def grid() -> tuple[Renderer, dict[str, Any]]:
     }  # fmt: skip
 
 
-MODELS = {"mlp": mlp, "grid": grid}
+class SeenAtOnce(BodySearch):
+    """Searches as if training had shown where pictures are wrong."""
+
+    def __call__(self, step: int, renderer: Renderer, frames: Frames, error_map: ErrorMap) -> bool:
+        return super().__call__(step, renderer, frames, wrong_where_matter_is(frames))
+
+
+def bodies() -> tuple[Renderer, dict[str, Any]]:
+    """A fast ball is found, carried and learnt."""
+    return a_renderer(), {
+        "frames": two_balls(), "num_rays": 64, "target_samples": 1500, "error_map": ErrorMap(resolution=24),
+        "body_search": SeenAtOnce(BOX, 0.3, min_steps=2),
+    }  # fmt: skip
+
+
+MODELS = {"mlp": mlp, "grid": grid, "bodies": bodies}
 
 
 class Mishap(Loss):
@@ -83,7 +100,7 @@ def train(model: str, steps: int, processes: Processes, folder: Path, **changes:
     torch.manual_seed(0)
     renderer, settings = MODELS[model]()
     before = {name: value.clone() for name, value in renderer.state_dict().items()}
-    frames = SyntheticData(make_scene("walker"), 16, num_train=6).frames("train")
+    frames = settings.pop("frames", None) or SyntheticData(make_scene("walker"), 16, num_train=6).frames("train")
     records: list[dict[str, Any]] = []
     settings |= {"log_every": 1, "checkpoint_every": 7, "progress_bar": False, **changes}
     Trainer(num_steps=steps, **settings).fit(
@@ -163,6 +180,7 @@ def compare(model: str, steps: int, count: int) -> dict[str, Any]:
         "occupied": [float(value.float().mean()) for name, value in one.items() if name.endswith("occupied")],
         "processes_equal": all(torch.equal(first[name], o["state"][name]) for o in several[1:] for name in first),
         "joined": [bool(value) for name, value in one.items() if name.endswith("joined")],
+        "bodies": [int((value > 0).sum()) for name, value in one.items() if name.endswith("bodies.radii")],
         "num_rays_equal": all(a["num_rays"] == b["num_rays"] for a, b in records),
         "num_rays_vary": len({a["num_rays"] for a, _ in records}) > 1,
         "loss_difference": max(abs(a["losses"]["loss"] - b["losses"]["loss"]) for a, b in records),

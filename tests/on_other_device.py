@@ -60,7 +60,7 @@ def walk(experiment: str, folder: str) -> dict[str, int]:
             "temporal.enabled=true", "temporal.num_frames=3", "temporal.resolution=16",
         ),
         "render": run(
-            "render.py", f"run={folder}", "path=orbit", "num_frames=13", "format=npz", "resolution=16",
+            "render.py", f"run={folder}", "path=orbit", "num_frames=16", "format=npz", "resolution=16",
             "outputs=[rgb,depth]",
         ),
         "motion": run(

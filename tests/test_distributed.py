@@ -43,7 +43,13 @@ def test_occupancy_and_what_joins_are_the_same_in_all_processes_and_in_one_alone
     assert result["joined"] == [True]
 
 
-@pytest.mark.parametrize("model", ["mlp", "grid"])
+def test_the_same_body_is_carried_by_all_processes(outcome: dict[str, Any]) -> None:
+    result = outcome["bodies"]
+    assert result["bodies"] == [1]
+    assert result["processes_equal"]
+
+
+@pytest.mark.parametrize("model", ["mlp", "grid", "bodies"])
 def test_only_the_first_process_writes(outcome: dict[str, Any], model: str) -> None:
     assert outcome[model]["files_written"] == [2, 0]
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from dnerf.cameras import Camera, Intrinsics, look_at
-from dnerf.deformations import DisplacementDeformation, FrameLattice
+from dnerf.deformations import CarriedBodies, DisplacementDeformation, FrameLattice
+from dnerf.deformations.carried_bodies import NOWHERE
 from dnerf.deformations.frame_lattice import FrozenDeformation
 from dnerf.fields import Baking, DeformedField, GridField, RadianceField, SpaceTimeVolumes
 from dnerf.kernels import use_backend
@@ -31,6 +32,7 @@ def model(
     cells: int = 24,
     brick_cells: int = 32,
     volumes: SpaceTimeVolumes | None = None,
+    bodies: CarriedBodies | None = None,
 ) -> Renderer:
     """A random body in the middle of the box, moved a little, as frames of a sequence see it."""
     torch.manual_seed(0)
@@ -47,6 +49,7 @@ def model(
     field = DeformedField(
         deformation, canonical,
         frame_lattice=FrameLattice(box or BOX, cells), baking=Baking(BOX, brick_cells, max_bricks=max_bricks),
+        bodies=bodies,
     )  # fmt: skip
     sampler = OccupancySampler(
         BOX, 0.03 * splits, 16, num_slabs=4, splits=splits, split_weight=0.02, margin=0, pad_to=64
@@ -99,6 +102,37 @@ def test_it_shows_what_the_chain_shows(time_terms: int, splits: int) -> None:
     assert expected[..., :3].std() > 0.05
     # Where opaque rays end and what is left out differ by the cut-off for each interval.
     torch.testing.assert_close(shown, expected, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("ahead", [0, 100])
+def test_rays_that_meet_carried_bodies_are_left_to_the_field(ahead: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dnerf.tracing.VERTICES_PER_RAY", ahead)
+    bodies = CarriedBodies(2, 3)
+    bodies.add(torch.tensor([[-0.3, 0.0, 0.1], [0.2, 0.1, 0.0], [0.3, 0.0, 0.1]]), torch.tensor([0.8, 0.8, 0.8]), 0.12)
+    bodies.add(torch.full((3, 3), NOWHERE), torch.tensor([0.1, -0.2, -0.3]), 0.1)  # it is not there
+    with use_backend("reference"):
+        expected = picture(model(stop=1e-5, bodies=bodies))
+        without = picture(model(stop=1e-5))
+    done = []
+    call = FrameTracer.__call__
+
+    def traced(self: FrameTracer, rays: Rays) -> tuple[Tensor, Tensor]:
+        sums, is_done = call(self, rays)
+        done.append((rays, is_done))
+        return sums, is_done
+
+    with patch.object(FrameTracer, "__call__", traced):
+        shown = picture(model(stop=1e-5, bodies=bodies))
+    torch.testing.assert_close(shown, expected, rtol=0, atol=1e-3)
+    assert float((expected - without).abs().max()) > 0.03
+    [(rays, is_done)] = done
+    center = bodies.centers(0, torch.tensor(0.3)).detach()
+    for place, radius in ((center, 0.12), (bodies.homes[1], 0.1)):
+        way = place - rays.origins
+        nearest = (way - (way * rays.directions).sum(-1, keepdim=True) * rays.directions).norm(dim=-1)
+        assert bool((nearest < radius).any())
+        assert not bool(is_done[nearest < radius].any())
+    assert float(is_done.float().mean()) > 0.7
 
 
 def test_what_is_filled_ahead_is_most_of_it_and_changes_nothing(

@@ -10,6 +10,7 @@ from dnerf.deformations.base import Deformation, check_positions_times
 
 NOWHERE = 1e4
 """Coordinate of a track while its body is not there; nothing is shown half as far out or further."""
+ROUNDING = 1e-3  # of a radius, by which a line may seem to miss a ball
 
 
 class CarriedBodies(nn.Module):
@@ -107,6 +108,19 @@ class CarriedBodies(nn.Module):
     def is_nowhere(positions: Tensor) -> Tensor:
         """Whether positions (..., 3) that `forward` gave are of an absent body's home, (...,) bool."""
         return positions.abs().amax(-1) > NOWHERE / 2
+
+    @torch.no_grad()
+    def are_met(self, origins: Tensor, directions: Tensor, time: float) -> Tensor:
+        """Which of the lines through origins (R, 3) along unit directions (R, 3) meet an exchanged ball, (R,) bool."""
+        now = self.tracks.new_tensor(time)
+        met = torch.zeros(len(origins), dtype=torch.bool, device=origins.device)
+        for number in range(self.num_bodies):
+            radius = self.radii[number] * (1 + ROUNDING)
+            for center in (self.centers(number, now), self.homes[number]):
+                way = center.to(origins.dtype) - origins
+                along = (way * directions).sum(-1, keepdim=True)
+                met |= (way - along * directions).norm(dim=-1) < radius
+        return met
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Positions (..., 3) at times (...,) with the balls exchanged: bodies are at home."""
