@@ -2,34 +2,27 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dnerf.checks import as_box, check_positive
 from dnerf.data.frames import Frames
 from dnerf.deformations import CarriedBodies
-from dnerf.deformations.carried_bodies import NOWHERE
 from dnerf.error_map import ErrorMap
+from dnerf.fast_bodies import fast_bodies, joined_bodies
 from dnerf.fields import DeformedField, SpaceTimeVolumes
 from dnerf.renderer import Renderer
 from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.sightings import small_wrong_things
-from dnerf.trajectories import ALIKE, GAP, Array, Path, PathSearch, Sighting
+from dnerf.trajectories import PathSearch, Sighting
 
 logger = logging.getLogger(__name__)
 
 LAST = 0.9  # progress, after which what is found cannot be learnt any more
-ALONE = 0.5  # least of a body's sightings that are
-MOST_MISSED = 0.5  # of its radius, by which half of its rays may pass its path
 ROOM = 1.6  # times a body's radius, in which it is carried
 BORDER = 0.02  # and so much more, in world units
-SIMILAR = 1.5  # most by which radii of one body's parts differ, as a factor
-OVERLAP = 4  # sightings of one part of its way within another: at their ends
-FINE = 101  # times at which a path is looked at
+FAR = 0.3  # of the tolerance, from a body's path: a sighting that hardly counts
 CANDIDATES = 4096  # for a home
 TIMES = 16  # at which it has to be empty
 SHOWN = 10.0  # times the density from which on a sampler looks: until what is at home has grown
@@ -40,53 +33,6 @@ PLANT_DEPTH = 2.3  # logarithm of the density that is planted: about ten for eac
 PLANT_LEFT = 0.25  # mean squared difference from it that is near enough
 ROUNDS_AT_END = 8  # of as many points each
 POINTS = 20_000  # on a track, to which a sampler's attention is called
-
-
-@dataclass(frozen=True, eq=False)
-class FastBody:
-    """A body that is to be carried.
-
-    Args:
-        path: of its sightings.
-        radius: in world units.
-        color: (3,).
-    """
-
-    path: Path
-    radius: float
-    color: Array
-
-    def may_be(self, other: "FastBody") -> bool:
-        """Whether both may be parts of one body's way: they look alike and are hardly ever there at once."""
-        is_alike = bool(np.abs(self.color - other.color).max() <= ALIKE)
-        sizes = sorted((self.radius, other.radius))
-        frames, others = sorted(self.path.sightings), sorted(other.path.sightings)
-        within = sum(frames[0] <= number <= frames[-1] for number in others)
-        return is_alike and sizes[1] < SIMILAR * sizes[0] and within <= OVERLAP
-
-    def and_then(self, other: "FastBody") -> "FastBody":
-        """One way of both; of frames in which both were seen, this one's sightings."""
-        sightings = {**other.path.sightings, **self.path.sightings}
-        return FastBody(Path(dict(sorted(sightings.items()))), max(self.radius, other.radius), self.color)
-
-    def track(self, num_knots: int, spacing: float) -> Tensor:
-        """Where it is at evenly spaced times, (num_knots, 3), float64: `NOWHERE` while nothing is known of it.
-
-        Short gaps are filled, and a way that ends near an end of the film goes on to there.
-
-        Args:
-            num_knots: from time 0 to 1.
-            spacing: of frames, in time.
-        """
-        knots, beside, reach = np.linspace(0, 1, num_knots), 1.01 / (num_knots - 1), (GAP + 1) * spacing
-        seen = [sighting.time for sighting in self.path.sightings.values()]
-        first = 0.0 if seen[0] <= reach else seen[0] - beside
-        last = 1.0 if seen[-1] >= 1 - reach else seen[-1] + beside
-        is_known = (knots >= first) & (knots <= last)
-        for before, after in pairwise(seen):
-            if after - before > 2 * reach:
-                is_known &= (knots <= before + beside) | (knots >= after - beside)
-        return torch.from_numpy(np.where(is_known[:, None], self.path.positions(knots), NOWHERE))
 
 
 class BodySearch:
@@ -116,9 +62,9 @@ class BodySearch:
     def __init__(
         self,
         box: Sequence[Sequence[float]],
-        begin: float = 0.42,
+        begin: float = 0.34,
         *,
-        min_steps: int = 208,
+        min_steps: int = 150,
         error: float = 0.02,
         resolution: int = 100,
         max_share: float = 0.02,
@@ -168,13 +114,14 @@ class BodySearch:
             return False
         times, order = frames.times.sort(stable=True)
         seen = self.sightings(frames, error_map)
-        search = PathSearch(self.box.tolist(), self.tolerance * float((self.box[1] - self.box[0]).amax()))
+        tolerance = self.tolerance * float((self.box[1] - self.box[0]).amax())
+        search = PathSearch(self.box.tolist(), tolerance)
         paths = search([seen[i] for i in order.tolist()], times.tolist())
-        found = self._joined(self._fast_ones(paths))
+        spacing = float(times.unique().diff().median()) if len(paths) else 0.0
+        found = joined_bodies(fast_bodies(paths, self.min_speed), spacing)
         room = len(bodies.radii) - bodies.num_bodies
-        spacing = float(frames.times.unique().diff().median()) if len(found) else 0.0
         tracks = [
-            (body.track(bodies.num_knots, spacing).to(bodies.tracks), ROOM * body.radius + BORDER)
+            (body.track(bodies.num_knots, spacing, FAR * tolerance).to(bodies.tracks), ROOM * body.radius + BORDER)
             for body in found[:room]
         ]
         generator = torch.Generator().manual_seed(0)
@@ -196,37 +143,6 @@ class BodySearch:
         return small_wrong_things(
             frames, error_map, error=self.error, resolution=self.resolution, max_share=self.max_share
         )
-
-    def _fast_ones(self, paths: Sequence[Path]) -> list[FastBody]:
-        """Those of them that are too fast, longest first; not parts of something larger, nor what hardly fits."""
-        found = []
-        for path in sorted(paths, key=lambda path: -len(path.sightings)):
-            seen = list(path.sightings.values())
-            numbers = list(path.sightings)
-            times = np.linspace(0, 1, FINE)
-            places = path.positions(times)
-            own = [_at(places, sighting.time) for sighting in seen]
-            radii = [sighting.radius_at(place) for sighting, place in zip(seen, own)]
-            moves = np.linalg.norm(np.diff(own, axis=0), axis=-1) / np.diff(numbers)
-            misses = [sighting.miss(place) for sighting, place in zip(seen, own)]
-            is_fast = np.median(moves) >= self.min_speed * np.median(radii)
-            is_alone = np.mean([sighting.is_alone for sighting in seen]) >= ALONE
-            if is_fast and is_alone and np.median(misses) <= MOST_MISSED * np.median(radii):
-                color = np.median([sighting.color for sighting in seen], axis=0)
-                found.append(FastBody(path, float(np.quantile(radii, 0.75)), color))
-        return found
-
-    def _joined(self, bodies: Sequence[FastBody]) -> list[FastBody]:
-        """The same with what may be one body, lost on its way, put together."""
-        joined: list[FastBody] = []
-        for body in bodies:
-            for number, other in enumerate(joined):
-                if body.may_be(other):
-                    joined[number] = other.and_then(body)
-                    break
-            else:
-                joined.append(body)
-        return joined
 
     def _home(
         self,
@@ -326,10 +242,3 @@ class BodySearch:
 def bodies_of(renderer: Renderer) -> CarriedBodies | None:
     """The bodies that a model can carry; None if it has no room for any."""
     return renderer.field.bodies if isinstance(renderer.field, DeformedField) else None
-
-
-def _at(places: Array, time: float) -> Array:
-    """Between places (T, 3) at even times from 0 to 1."""
-    number = time * (len(places) - 1)
-    before = min(int(number), len(places) - 2)
-    return places[before] + (number - before) * (places[before + 1] - places[before])

@@ -2,7 +2,8 @@
 
 A field whose space-time volumes have joined (`dnerf.fields.SpaceTimeVolumes`) shows bodies where they are at each time
 without saying that they are the same ones: its pictures are right, its deformation leaves those bodies where they are.
-So a velocity field is sought in the world along whose tracks what the field holds stays the same.
+So a velocity field is sought in the world along whose tracks what the field holds stays the same; if bodies are
+carried, whose motion is known, behind these.
 """
 
 import math
@@ -17,7 +18,7 @@ from tqdm import tqdm
 
 from dnerf.checks import check_positive
 from dnerf.data.frames import Frames
-from dnerf.deformations import Deformation, FlowDeformation
+from dnerf.deformations import CarriedBodies, Deformation, FlowDeformation
 from dnerf.deformations.solvers import fixed_steps
 from dnerf.fields import DeformedField, SpaceTimeVolumes
 from dnerf.motion import carry
@@ -26,6 +27,9 @@ from dnerf.renderer import Renderer
 
 Contents = Callable[[Tensor, Tensor], Tensor]
 """What a field holds, (M, 4), at positions (M, 3) and times (M,)."""
+
+Carried = Callable[[Tensor, Tensor, Tensor, float], Tensor]
+"""Where positions (M, 3) at times (M,) are at other times (M,), so far apart at most."""
 
 CHUNK = 16384  # rays, and points, at a time
 LOOKING = (0.0, 0.0, 1.0)
@@ -172,8 +176,9 @@ class MotionSearch:
             seen = self._seen_matter(renderer, frames.to(renderer.device), generator)
             if not len(seen.times):
                 return None
-            self._fit(flow, contents, seen, generator, progress_bar=progress_bar)
-            found = self._judged(field.modelled_motion, flow, contents, seen, generator)
+            carried = partial(self._carried, flow, field.bodies)
+            self._fit(flow, carried, contents, seen, generator, progress_bar=progress_bar)
+            found = self._judged(field.modelled_motion, carried, contents, seen, generator)
         field.set_found_motion(found.is_motion)
         if not found.is_motion:
             flow.load_state_dict(at_rest)
@@ -198,6 +203,7 @@ class MotionSearch:
     def _fit(
         self,
         flow: FlowDeformation,
+        carried: Carried,
         contents: Contents,
         seen: SeenMatter,
         generator: torch.Generator,
@@ -218,7 +224,7 @@ class MotionSearch:
             ends, span = self._ends(times, progress, generator)
             with torch.no_grad():
                 before = contents(positions, times)
-            moved = self._carried(flow, positions, times, ends, span)
+            moved = carried(positions, times, ends, span)
             change = (contents(moved, ends) - before).square().sum(-1).mean()
             speed = flow.velocity(positions, times).square().sum(-1).mean()
             optimizer.zero_grad(set_to_none=True)
@@ -238,13 +244,25 @@ class MotionSearch:
         ends = times + span * (2 * torch.rand(len(times), generator=generator, device=times.device) - 1)
         return 1 - (1 - ends.abs()).abs(), span
 
-    def _carried(self, flow: FlowDeformation, positions: Tensor, times: Tensor, ends: Tensor, span: float) -> Tensor:
+    def _carried(
+        self,
+        flow: FlowDeformation,
+        bodies: CarriedBodies | None,
+        positions: Tensor,
+        times: Tensor,
+        ends: Tensor,
+        span: float,
+    ) -> Tensor:
+        """Positions (M, 3) at times (M,) where they are at the ends (M,): the flow goes on behind the bodies."""
         lengths = ends - times
 
         def velocity(s: float | Tensor, places: Tensor) -> Tensor:
             return lengths[:, None] * flow.velocity(places, times + s * lengths)
 
-        return fixed_steps("midpoint", velocity, positions, math.ceil(span / self.step))
+        if bodies is not None:
+            positions = bodies(positions, times)
+        moved = fixed_steps("midpoint", velocity, positions, math.ceil(span / self.step))
+        return moved if bodies is None else bodies.inverse(moved, ends)
 
     def _contents(self, renderer: Renderer, positions: Tensor, times: Tensor) -> Tensor:
         """Opacity, and colour times opacity, (M, 4)."""
@@ -257,7 +275,7 @@ class MotionSearch:
     def _judged(
         self,
         deformation: Deformation,
-        flow: FlowDeformation,
+        carried: Carried,
         contents: Contents,
         seen: SeenMatter,
         generator: torch.Generator,
@@ -266,7 +284,7 @@ class MotionSearch:
         positions, times = self._drawn(seen, CHUNK, generator)
         ends, span = self._ends(times, 1.0, generator)
         here = contents(positions, times)
-        moved = (carry(deformation, positions, times, ends)[0], self._carried(flow, positions, times, ends, span))
+        moved = (carry(deformation, positions, times, ends)[0], carried(positions, times, ends, span))
         changes = (float((contents(places, ends) - here).square().sum(-1).mean()) for places in moved)
         return FoundMotion(*changes)
 

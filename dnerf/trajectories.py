@@ -13,9 +13,13 @@ ALIKE = 0.25  # most that colours of one body's sightings differ
 SIZES = 2.5  # most by which their radii do, as a factor
 WINDOW = 8  # sightings of which a path's next place is foretold
 GAP = 4  # frames in a row without a sighting after which a path ends
+MOST_SKIPPED = 1  # of them, behind which something that is not alone may be a path's last sighting
 AROUND = (-2, -1, 1, 2)  # frames beside three in a row that have to agree with them, two at least
 MOST_BEGINNING = 4  # sightings of a frame, the first ones that are alone, with which paths begin
 MOST_TRIED = 400  # beginnings of paths
+STIFFNESS, STIFF = 0.1, 10.0  # weights of third differences: at first, and where a path does not turn
+TURN = 0.3  # of the scale of distances, from which third differences are a turn
+ROUNDS = 8  # of reweighting
 CURVED = 5  # sightings from which on a path is taken for curved
 
 
@@ -89,31 +93,56 @@ class Path:
 
     sightings: dict[int, Sighting]
 
-    def positions(self, times: Array, *, stiffness: float = 0.1) -> Array:
+    def positions(self, times: Array, *, scale: float | None = None) -> Array:
         """Where the body is at evenly spaced times (T,): the smooth path that passes its rays most closely, (T, 3).
 
-        Least squares of distances from rays and of third differences; before and after all sightings it goes straight
-        on.
+        Least squares of distances from rays and of third differences; before and after all sightings it goes on as it
+        went last. With a scale both are reweighted some rounds: a ray that is passed far away and a turn between two
+        times then hardly count, so that single wrong sightings do not bend the path, and it is as stiff as bodies that
+        nothing hits.
+
+        Source: iteratively reweighted least squares (Holland and Welsch 1977) with Cauchy's weights.
 
         Args:
             times: T >= 4, increasing evenly.
-            stiffness: weight of the third differences.
+            scale: distance from a ray, in world units, from which that hardly counts; None takes all as they are.
         """
         count, step = len(times), times[1] - times[0]
-        matrix = np.zeros((count, 3, count, 3))
-        right = np.zeros((count, 3))
-        for sighting in self.sightings.values():
-            place = float(np.clip((sighting.time - times[0]) / step, 0, count - 1))
-            before = min(int(place), count - 2)
-            shares = {before: before + 1 - place, before + 1: place - before}
-            for (i, a), (j, b) in product(shares.items(), repeat=2):
-                matrix[i, :, j] += a * b * sighting.across
-            for i, a in shares.items():
-                right[i] += a * (sighting.across @ sighting.origin)
+        sightings = list(self.sightings.values())
+        seen = np.array([sighting.time for sighting in sightings])
+        places = np.clip((seen - times[0]) / step, 0, count - 1)
+        before, numbers = np.minimum(places.astype(int), count - 2), np.arange(len(places))
+        shares = np.zeros((len(places), count))
+        shares[numbers, before], shares[numbers, before + 1] = before + 1 - places, places - before
+        across = np.stack([sighting.across for sighting in sightings])
+        origins = np.stack([sighting.origin for sighting in sightings])
         third, second = (np.diff(np.eye(count), n=n, axis=0) for n in (3, 2))
-        prior = stiffness * third.T @ third + 1e-3 * stiffness * second.T @ second + 1e-9 * np.eye(count)
-        full = matrix.reshape(3 * count, 3 * count) + np.kron(prior, np.eye(3))
-        return np.asarray(np.linalg.solve(full, right.reshape(-1)).reshape(count, 3), dtype=np.float64)
+        slack = 1e-3 * STIFFNESS * second.T @ second + 1e-9 * np.eye(count)
+        weights, stiffness, rounds = np.ones(len(places)), np.full(count - 3, STIFFNESS), 0
+        while True:
+            weighted = (shares * weights[:, None]).T
+            matrix = np.einsum("in,nj,nab->iajb", weighted, shares, across, optimize=True)
+            right = np.einsum("in,nab,nb->ia", weighted, across, origins, optimize=True)
+            prior = np.kron(third.T @ (stiffness[:, None] * third) + slack, np.eye(3))
+            found = np.linalg.solve(matrix.reshape(3 * count, 3 * count) + prior, right.reshape(-1)).reshape(count, 3)
+            if scale is None or rounds == ROUNDS:
+                return np.asarray(found, dtype=np.float64)
+            misses = np.linalg.norm(np.einsum("nab,nb->na", across, shares @ found - origins), axis=-1)
+            weights = 1 / (1 + (misses / scale) ** 2)
+            stiffness = STIFF / (1 + (np.linalg.norm(third @ found, axis=-1) / (TURN * scale)) ** 2)
+            rounds += 1
+
+
+def without_stragglers(sightings: dict[int, Sighting]) -> dict[int, Sighting]:
+    """The same in order, without what was found at either end behind frames in vain, if it is not even alone."""
+    kept = dict(sorted(sightings.items()))
+    for is_last in (False, True):
+        while len(kept) > 1:
+            end, beside = sorted(kept, reverse=is_last)[:2]
+            if kept[end].is_alone or abs(beside - end) <= MOST_SKIPPED + 1:
+                break
+            del kept[end]
+    return kept
 
 
 def triangulated(sightings: Sequence[Sighting], degree: int, time: float, unit: float) -> Array:
@@ -261,7 +290,7 @@ class PathSearch:
                     missed += 1
                 else:
                     found[number], missed = sighting, 0
-        return found
+        return without_stragglers(found)
 
     def _next(
         self, known: Sequence[Sighting], candidates: Sequence[Sighting], time: float, unit: float, missed: int

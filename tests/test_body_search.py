@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from dnerf.backgrounds import RandomBackground
-from dnerf.body_search import BodySearch, FastBody
+from dnerf.body_search import BodySearch
 from dnerf.data import SyntheticData
 from dnerf.data.frames import Frames
 from dnerf.deformations import CarriedBodies, DisplacementDeformation, FrameLattice, IdentityDeformation
 from dnerf.deformations.carried_bodies import NOWHERE
 from dnerf.error_map import ErrorMap
+from dnerf.fast_bodies import FastBody, fast_bodies, joined_bodies
 from dnerf.fields import Baking, DeformedField, GridField, SpaceTimeVolumes
 from dnerf.motion import carry, motion_model
 from dnerf.renderer import Renderer
@@ -162,11 +163,15 @@ def test_parts_of_something_larger_and_what_hardly_fits_are_not_carried(frames: 
     search, error_map = BodySearch(BOX), wrong_where_matter_is(frames)
     seen = search.sightings(frames, error_map)
     assert sum(sighting.is_alone for here in seen for sighting in here) > 1.3 * NUM_FRAMES
-    path = max((p for p in paths_in(seen, frames) if search._fast_ones([p])), key=lambda p: len(p.sightings))
+    path = max(
+        (p for p in paths_in(seen, frames) if fast_bodies([p], search.min_speed)), key=lambda p: len(p.sightings)
+    )
     attached = {number: replace(s, is_alone=False) for number, s in path.sightings.items()}
-    assert search._fast_ones([BodyPath(attached)]) == []
+    [fast] = fast_bodies([BodyPath(attached)], search.min_speed)
+    assert not fast.is_alone
+    assert joined_bodies([fast], 1 / NUM_FRAMES) == []
     smaller = {number: replace(s, angle=0.01 * s.angle) for number, s in path.sightings.items()}
-    assert search._fast_ones([BodyPath(smaller)]) == []
+    assert fast_bodies([BodyPath(smaller)], search.min_speed) == []
 
 
 def paths_in(seen: list[list[Sighting]], frames: Frames) -> list[BodyPath]:
@@ -195,6 +200,24 @@ def test_parts_of_one_way_are_joined_if_they_look_alike_and_are_never_there_at_o
     assert joined.path.sightings[19].angle == whole.path.sightings[19].angle
     assert joined.radius == 0.25
     assert not joined.may_be(part(30, 45))
+
+
+def test_a_part_that_is_not_alone_is_joined_where_a_body_leads_to_it() -> None:
+    whole = part(10, 30)
+    for beside in (part(0, 8), part(32, 45), part(35, 45)):
+        attached = replace(beside, is_alone=False)
+        assert whole.leads_to(attached, 0.02)
+        [joined] = joined_bodies([attached, whole], 0.02)
+        assert len(joined.path.sightings) == 21 + len(beside.path.sightings)
+        assert joined.is_alone
+    late = replace(part(40, 50), is_alone=False)  # nothing is known of the frames in between
+    assert not whole.leads_to(late, 0.02)
+    aside = {n: replace(s, origin=s.origin + np.array([0.0, 0.5, 0.5])) for n, s in part(32, 45).path.sightings.items()}
+    elsewhere = replace(part(32, 45), path=BodyPath(aside), is_alone=False)
+    assert not whole.leads_to(elsewhere, 0.02)
+    for other in (late, elsewhere):
+        assert joined_bodies([other, whole], 0.02) == [whole]
+    assert len(joined_bodies([part(40, 50), whole], 0.02)[0].path.sightings) == 32  # by looks, if both are alone
 
 
 def test_a_track_fills_short_gaps_reaches_the_films_ends_and_is_nowhere_else() -> None:

@@ -30,6 +30,7 @@ FLOORS = {
     "quadrature": 1,
     "deformations": 2,
     "fields": 3,
+    "fast_bodies": 3,
     "frame_graphs": 4,
     "samplers": 4,
     "tracing": 4,

@@ -11,7 +11,7 @@ from dnerf.checkpoints import load_weights, save_weights
 from dnerf.compositing import FieldOutput
 from dnerf.data import SyntheticData
 from dnerf.data.frames import Frames
-from dnerf.deformations import FlowDeformation, IdentityDeformation
+from dnerf.deformations import CarriedBodies, FlowDeformation, IdentityDeformation
 from dnerf.deformations.velocities import NetworkVelocity
 from dnerf.fields import DeformedField, RadianceField, SpaceTimeVolumes
 from dnerf.motion import carry, motion_model
@@ -163,6 +163,29 @@ def test_the_same_seed_finds_the_same(frames: Frames) -> None:
         states.append(torch.cat([p.detach().flatten() for p in renderer.field.motion_flow.parameters()]))
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
+
+
+@torch.no_grad()
+def test_motion_that_is_found_is_behind_what_is_carried() -> None:
+    """A carried body goes on its track, all else with the flow; without a velocity both are what the bodies say."""
+    bodies = CarriedBodies(1, 6)
+    track = going(torch.linspace(0, 1, 6))
+    bodies.add(track, torch.tensor([1.0, -1.0, 1.0]), 0.4)
+    flow = FlowDeformation(NetworkVelocity(BOX, 2, 16), 0.5, solver="midpoint", num_steps=8)
+    field = DeformedField(IdentityDeformation(), Balls(resting), motion_flow=flow, bodies=bodies)
+    field.set_found_motion(True)
+    moves = 0.2 * torch.randn(50, 3).clamp(-1, 1)
+    times, ends = torch.full((50,), 0.2), torch.full((50,), 0.4)
+    search = MotionSearch()
+    for start, end in ((going(times) + moves, going(ends) + moves), (resting(times) + moves, resting(ends) + moves)):
+        torch.testing.assert_close(search._carried(flow, bodies, start, times, ends, 0.3), end, rtol=0, atol=1e-5)
+        torch.testing.assert_close(carry(field.motion, start, 0.2, 0.4)[0], end, rtol=0, atol=1e-5)
+    assert flow.velocity.mlp.output is not None
+    flow.velocity.mlp.output.bias.fill_(0.1)
+    for start, end in ((going(times) + moves, going(ends) + moves), (resting(times) + moves, resting(ends) + moves)):
+        by_search = search._carried(flow, bodies, start, times, ends, 0.3)
+        assert float((by_search - end).norm(dim=-1).mean()) > 1e-3
+        torch.testing.assert_close(carry(field.motion, start, 0.2, 0.4)[0], by_search, rtol=0, atol=2e-3)
 
 
 def test_fields_whose_volumes_wait_are_left_alone(frames: Frames) -> None:

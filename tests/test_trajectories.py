@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dnerf.trajectories import Array, Path, PathSearch, Sighting, triangulated
+from dnerf.trajectories import Array, Path, PathSearch, Sighting, triangulated, without_stragglers
 
 BOX = [[-1.5] * 3, [1.5] * 3]
 TIMES = np.linspace(0, 1, 100)
@@ -108,6 +108,52 @@ def test_positions_go_straight_on_outside_of_what_is_seen() -> None:
     line = np.outer(TIMES, [0.5, -0.3, 0.2])
     path = Path({i: sighting(TIMES[i], line[i], generator) for i in range(10, 90)})
     np.testing.assert_allclose(path.positions(TIMES), line, atol=5e-3)
+
+
+def misses_of(times: Array, truth: Array, path: Path, **settings: float) -> Array:
+    return np.linalg.norm(path.positions(times, **settings) - truth, axis=-1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_single_wrong_sightings_do_not_bend_a_path_with_a_scale(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    truth = circle(TIMES)
+    seen = {i: sighting(t, truth[i], generator, noise=0.005) for i, t in enumerate(TIMES) if generator.uniform() < 0.7}
+    for number in (20, 55, 80):
+        seen[number] = sighting(TIMES[number], truth[number] + [0.2, -0.2, 0.2], generator)
+    path = Path(dict(sorted(seen.items())))
+    plain, robust = misses_of(TIMES, truth, path), misses_of(TIMES, truth, path, scale=0.03)
+    assert plain[[20, 55, 80]].max() > 0.04
+    assert robust[[20, 55, 80]].max() < 0.02
+    assert robust[8:92].max() < 0.03
+    assert robust.mean() < 0.7 * plain.mean()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_a_scale_paths_are_stiff_but_bounce(seed: int) -> None:
+    """Off the sharp turn no further than a ball of 0.06 would show, and elsewhere as near as rays allow."""
+    generator = np.random.default_rng(seed)
+    height = np.abs(1 - 4 * np.abs(TIMES - 0.5)) - 0.5
+    truth = np.stack([2 * TIMES - 1, 0.5 * TIMES, height], axis=-1)
+    seen = {i: sighting(t, truth[i], generator, noise=0.003) for i, t in enumerate(TIMES)}
+    robust = misses_of(TIMES, truth, Path(seen), scale=0.03)
+    assert robust.max() < 0.06
+    assert np.median(robust) < 0.005
+    turned = misses_of(TIMES, truth, Path(seen))
+    assert np.median(robust) < np.median(turned)
+
+
+def test_what_is_not_alone_is_no_end_of_a_path_behind_frames_in_vain() -> None:
+    generator = np.random.default_rng(0)
+    truth = circle(TIMES)
+    seen = {i: sighting(TIMES[i], truth[i], generator) for i in (3, *range(20, 50), 53, 55)}
+    assert list(without_stragglers(seen)) == list(seen)  # they are alone
+    beside = {number: replace(each, is_alone=number in range(20, 50)) for number, each in seen.items()}
+    assert list(without_stragglers(beside)) == [*range(20, 50), 53, 55]  # each of the last two confirms the other
+    del beside[55]
+    assert list(without_stragglers(beside)) == [*range(20, 50)]
+    lone = {3: beside[3]}
+    assert without_stragglers(lone) == lone
 
 
 def test_behind_a_camera_nothing_has_a_size() -> None:

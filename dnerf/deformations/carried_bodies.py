@@ -99,7 +99,9 @@ class CarriedBodies(nn.Module):
 
     def centers(self, number: int, times: Tensor) -> Tensor:
         """Where a body's centre is, (..., 3), at times (...,) in [0, 1]."""
-        track = self.tracks[number]
+        return self._along(self.tracks[number], times)
+
+    def _along(self, track: Tensor, times: Tensor) -> Tensor:
         places = times.detach().to(track.dtype).clamp(0, 1) * (self.num_knots - 1)
         before = places.long().clamp_(max=self.num_knots - 2)
         return torch.lerp(track[before], track[before + 1], (places - before)[..., None])
@@ -124,21 +126,41 @@ class CarriedBodies(nn.Module):
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Positions (..., 3) at times (...,) with the balls exchanged: bodies are at home."""
-        return self._exchanged(positions, times, range(self.num_bodies))
+        return self._exchanged(positions, times, self.tracks, range(self.num_bodies))
 
     def inverse(self, positions: Tensor, times: Tensor) -> Tensor:
-        """World positions (..., 3) at times (...,) of what `forward` gives."""
-        return self._exchanged(positions, times, reversed(range(self.num_bodies)))
+        """World positions (..., 3) at times (...,) of what `forward` gives.
 
-    def _exchanged(self, positions: Tensor, times: Tensor, numbers: Iterable[int]) -> Tensor:
+        While a body is not there, this says where it may be: between its last place and its next one, or at the first
+        or the last that is known.
+        """
+        return self._exchanged(positions, times, self._filled(), reversed(range(self.num_bodies)))
+
+    def _filled(self) -> Tensor:
+        """Tracks without `NOWHERE`."""
+        knots = torch.arange(self.num_knots, device=self.tracks.device).expand(self.tracks.shape[:2])
+        is_there = ~self.is_nowhere(self.tracks)
+        before = torch.where(is_there, knots, -1).cummax(1).values
+        after = torch.where(is_there, knots, self.num_knots).flip(1).cummin(1).values.flip(1)
+        before, after = torch.where(before < 0, after, before), torch.where(after < self.num_knots, after, before)
+        share = (knots - before).to(self.tracks.dtype) / (after - before).clamp(min=1)
+        bodies = torch.arange(len(self.tracks), device=knots.device)[:, None]
+        last = self.num_knots - 1  # of a track that is nowhere at all
+        return torch.lerp(
+            self.tracks[bodies, before.clamp(max=last)], self.tracks[bodies, after.clamp(0, last)], share[..., None]
+        )
+
+    def _exchanged(self, positions: Tensor, times: Tensor, tracks: Tensor, numbers: Iterable[int]) -> Tensor:
+        """Positions with balls exchanged; what is at home goes to where `tracks` say."""
         check_positions_times(positions, times)
         for number in numbers:
-            way = (self.homes[number] - self.centers(number, times)).to(positions.dtype)
+            home, center = self.homes[number].to(positions.dtype), self.centers(number, times).to(positions.dtype)
+            place = center if tracks is self.tracks else self._along(tracks[number], times).to(positions.dtype)
             with torch.no_grad():
-                from_home = positions - self.homes[number].to(positions.dtype)
-                is_away = (from_home + way).norm(dim=-1, keepdim=True) < self.radii[number]
-                is_home = from_home.norm(dim=-1, keepdim=True) < self.radii[number]
-            positions = positions + (is_away.to(way.dtype) - is_home.to(way.dtype)) * way
+                is_there = ~self.is_nowhere(center)[..., None]  # no two bodies meet while they are not
+                is_away = ((positions - center).norm(dim=-1, keepdim=True) < self.radii[number]) & is_there
+                is_home = (positions - home).norm(dim=-1, keepdim=True) < self.radii[number]
+            positions = positions + is_away.to(home.dtype) * (home - center) + is_home.to(home.dtype) * (place - home)
         return positions
 
 

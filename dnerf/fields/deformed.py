@@ -81,18 +81,21 @@ class DeformedField(RadianceField):
     def motion(self) -> Deformation:
         """How matter moves, as a map from the world to one place per piece of matter.
 
-        It is the deformation, or the flow that has been fitted instead.
+        It is the deformation, or the flow that has been fitted instead, behind the bodies that are carried.
         """
         if self.motion_flow is not None and self.has_found_motion:
-            return self.motion_flow
+            return self._behind_bodies(self.motion_flow)
         return self.modelled_motion
 
     @property
     def modelled_motion(self) -> Deformation:
         """The deformation, behind the bodies that are carried, if there are any."""
+        return self._behind_bodies(self.deformation)
+
+    def _behind_bodies(self, deformation: Deformation) -> Deformation:
         if self.bodies is None or not self.bodies.num_bodies:
-            return self.deformation
-        return CarriedDeformation(self.bodies, self.deformation)
+            return deformation
+        return CarriedDeformation(self.bodies, deformation)
 
     def carried(self, positions: Tensor, times: Tensor) -> Tensor:
         """Positions (..., 3) at times (...,) as the deformation sees them: small fast bodies are at home."""

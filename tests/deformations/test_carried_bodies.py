@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dnerf.checkpoints import load_weights, save_weights
 from dnerf.deformations import CarriedBodies, CarriedDeformation, DisplacementDeformation, IdentityDeformation
+from dnerf.deformations.carried_bodies import NOWHERE
 from dnerf.motion import carry, follow
 
 HOMES = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0]], dtype=torch.float64)
@@ -65,6 +66,25 @@ def test_bodies_are_at_home_homes_are_around_bodies_and_the_rest_stays() -> None
 
 
 @torch.no_grad()
+@torch.no_grad()
+def test_motion_says_where_a_body_may_be_while_it_is_not_there() -> None:
+    """On a straight line over a gap, at rest before and after all; matter that is where it may be stays."""
+    bodies, track = CarriedBodies(3, 11).double(), tracks()[1]
+    seen = track.clone()
+    seen[[0, 1, 5, 6, 7, 10]] = NOWHERE
+    bodies.add(seen, HOMES[0], 0.3)
+    bodies.add(torch.full_like(track, NOWHERE), HOMES[1], 0.2)
+    model = CarriedDeformation(bodies, IdentityDeformation())
+    moves = torch.tensor([[0.05, 0.1, -0.1], [0.0, 0.0, 0.2]], dtype=torch.float64)
+    for time, place in ((0.0, 0.2), (0.1, 0.2), (0.5, 0.5), (0.62, 0.62), (0.85, 0.85), (0.99, 0.9), (1.0, 0.9)):
+        moved, residual = carry(model, bodies.centers(0, torch.tensor([0.3])) + moves, 0.3, time)
+        torch.testing.assert_close(moved - moves, (track[0] + 2.2 * place * torch.tensor([1.0, 0, 0])).expand(2, 3))
+        assert float(residual.max()) < 1e-9
+    there = track[6] + moves
+    torch.testing.assert_close(carry(model, there, 0.6, 0.61)[0], there)
+    assert bool(bodies.is_nowhere(bodies(HOMES[0] + moves, torch.tensor([0.6, 0.6]))).all())
+
+
 def test_tracks_are_straight_between_knots_and_exact_at_them() -> None:
     bodies = two_bodies()
     knots = torch.linspace(0, 1, 11, dtype=torch.float64)
