@@ -167,7 +167,7 @@ def test_pictures_follow_what_joins_and_what_is_carried() -> None:
         assert float((a - b).abs().max()) > 0.02
 
 
-def test_what_is_not_replayable_shows(frames: Frames) -> None:
+def test_what_is_not_replayable_shows() -> None:
     """The harness notices a number of the host that changes, and a value that is asked for."""
 
     class Counting(nn.Module):
