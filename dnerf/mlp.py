@@ -52,6 +52,7 @@ class MLP(nn.Module):
         check_positive("num_layers", num_layers, allow_zero=True)
         if any(not 0 < skip < num_layers for skip in skips):
             raise ValueError(f"skips must lie in 1..{num_layers - 1}, got {tuple(skips)}")
+        self.in_features = in_features
         self.skips = frozenset(skips)
         widths = [
             (in_features if i == 0 else hidden_features) + (in_features if i in self.skips else 0)
@@ -69,13 +70,27 @@ class MLP(nn.Module):
             nn.init.zeros_(self.output.weight)
             nn.init.zeros_(self.output.bias)
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Map (..., in_features) -> (..., out_features)."""
-        x = inputs
+    def forward(self, inputs: Tensor, scale: Tensor | None = None) -> Tensor:
+        """Map (..., in_features) -> (..., out_features).
+
+        Args:
+            inputs: (..., n); those that lack, n < in_features, are the last ones, and count as 0.
+            scale: (n,), on each input; None for 1. A network without skips scales its weights instead.
+        """
+        x = self.before_output(inputs, scale)
+        return x if self.output is None else self.output(x)
+
+    def before_output(self, inputs: Tensor, scale: Tensor | None = None) -> Tensor:
+        """Map (..., n) to what the last linear map sees, see `forward`."""
         if self.hidden and not self.skips and self.activation is torch.relu_:
             layers = [cast(nn.Linear, layer) for layer in self.hidden]
-            x = relu_layers(x, [layer.weight for layer in layers], [layer.bias for layer in layers])
-        else:
-            for i, layer in enumerate(self.hidden):
-                x = self.activation(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
-        return x if self.output is None else self.output(x)
+            first, *others = (layer.weight for layer in layers)
+            first = first[:, : inputs.shape[-1]]
+            first = first if scale is None else first * scale.to(first.dtype)
+            return relu_layers(inputs, [first, *others], [layer.bias for layer in layers])
+        if scale is not None:
+            inputs = inputs * scale.to(inputs.dtype)
+        x = inputs = nn.functional.pad(inputs, (0, self.in_features - inputs.shape[-1]))
+        for i, layer in enumerate(self.hidden):
+            x = self.activation(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
+        return x

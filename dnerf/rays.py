@@ -171,18 +171,20 @@ class Samples:
 
     def kept(self, mask: Tensor) -> "Samples":
         """Those packed samples for which `mask` (N,) holds; proposals are dropped."""
+        check_shape("mask", mask, self.starts.shape)
+        return self.chosen(mask.nonzero()[:, 0])
+
+    def chosen(self, numbers: Tensor) -> "Samples":
+        """Those packed samples whose numbers (n,), in order, are given; proposals are dropped."""
         if self.ray_indices is None:
             raise ValueError("samples must be packed to be chosen from, got dense samples")
-        check_shape("mask", mask, self.starts.shape)
-        chosen = mask.nonzero()[:, 0]
-        before = torch.nn.functional.pad(mask.cumsum(0), (1, 0))
         return Samples(
-            self.starts[chosen],
-            self.ends[chosen],
+            self.starts.index_select(0, numbers),
+            self.ends.index_select(0, numbers),
             self.num_rays,
-            ray_indices=self.ray_indices[chosen],
-            points=None if self.points is None else self.points[chosen],
-            ray_offsets=before[self.offsets],
+            ray_indices=self.ray_indices.index_select(0, numbers),
+            points=None if self.points is None else self.points.index_select(0, numbers),
+            ray_offsets=torch.searchsorted(numbers, self.offsets),
         )
 
     def split(self, counts: int | Tensor) -> "Samples":
@@ -204,8 +206,7 @@ class Samples:
         if not bool((counts >= 1).all()):
             raise ValueError(f"counts must be at least 1, got {int(counts.min())}")
         before = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-        whole = torch.repeat_interleave(counts, output_size=int(before[-1]))
-        number = torch.arange(len(whole), device=whole.device) - before[whole]
+        whole, number = parts_of(counts)
         starts, ends, parts = self.starts[whole], self.ends[whole], counts[whole].to(self.starts.dtype)
         return replace(
             self,
@@ -260,3 +261,10 @@ class Samples:
             points=None if self.points is None else self.points[mask],
             ray_indices=mask.nonzero()[:, 0],
         )
+
+
+def parts_of(counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Which interval each part is of, and its number there, both (M,), where so many (N,) are made of each in turn."""
+    ends = counts.cumsum(0)
+    whole = torch.repeat_interleave(counts)
+    return whole, torch.arange(len(whole), device=whole.device) - (ends - counts)[whole]

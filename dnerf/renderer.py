@@ -11,8 +11,9 @@ from torch import Tensor, nn
 from dnerf.backgrounds import Background, ConstantBackground
 from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
-from dnerf.compositing import FieldOutput, Rendering, composite, safe_divide
-from dnerf.fields.base import RadianceField
+from dnerf.compositing import Rendering, composite, safe_divide
+from dnerf.deformations.frame_lattice import FrozenDeformation
+from dnerf.fields.base import RadianceField, ask
 from dnerf.frame_graphs import FrameGraphs
 from dnerf.kernels import few_nonzero
 from dnerf.quadrature import check_rule
@@ -24,7 +25,6 @@ from dnerf.tracing import FrameTracer
 logger = logging.getLogger(__name__)
 
 PAD_TO = 2048  # samples; see `Samples.padded`
-MOST_AT_ONCE = 1 << 17  # samples of a picture that the field is asked in one go: bounds the memory, in haze
 FRAMES_THAT_SHARE = 16  # from so many on a sequence has gained what keeping things between its frames costs
 MOST_TO_SHARE = 0.1  # of space, in which samples fall: haze is dearer to keep than to ask
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
@@ -141,8 +141,9 @@ class Renderer(nn.Module):
             chosen = rays[ray_numbers]
             with self.autocast(rays.origins.device):
                 if refines:
-                    part = self.sampler.refined(part, chosen, field, transmittance, self.stop_transmittance)
-                output = _in_parts(field, *part.locate(chosen))
+                    part, output = self.sampler.refined(part, chosen, field, transmittance, self.stop_transmittance)
+                else:
+                    output = ask(field, *part.locate(chosen))
             seen = composite(part, output)
             columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
             sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))
@@ -257,6 +258,10 @@ class Renderer(nn.Module):
         grid = self.sampler.grid_at(time, camera.pose.dtype)
         field = self.field.at_time(time, None if grid is None else grid.extent())
         tracer = FrameTracer.of(field, grid, time, self.stop_transmittance) if self._ends_early else None
+        lattice = getattr(field, "deformation", None)
+        if tracer is None and grid is not None and isinstance(lattice, FrozenDeformation):
+            with self.autocast(self.device):
+                lattice.fill_around(grid, len(rays))
         parts = list(self._in_chunks(rays, field, chunk, tracer))
         columns = [_columns(part) for part in parts]
         if numbers is None:
@@ -320,13 +325,3 @@ class Renderer(nn.Module):
 def _columns(shown: Rendering) -> Tensor:
     """Colour, opacity and depth (R, 5)."""
     return torch.cat([shown.rgb, shown.opacity[:, None], shown.depth[:, None]], dim=-1)
-
-
-def _in_parts(field: RadianceField, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
-    """Density and colour of a field, asked so many samples at a time."""
-    if len(times) <= MOST_AT_ONCE:
-        return field(positions, directions, times)
-    parts = [
-        field(*part) for part in zip(*(x.split(MOST_AT_ONCE) for x in (positions, directions, times)), strict=True)
-    ]
-    return FieldOutput(torch.cat([part.density for part in parts]), torch.cat([part.rgb for part in parts]))

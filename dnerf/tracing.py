@@ -12,7 +12,6 @@ from dnerf.kernels.backend import choose
 from dnerf.kernels.trace import DONE, ELSEWHERE, NUM_STATES
 from dnerf.rays import Rays
 
-VERTICES_PER_RAY = 4  # most to ask around all occupied cells, instead of finding out which of them rays want
 PIONEERS = 5  # one ray of so many is sent ahead once, to find what most of its neighbours will want
 
 
@@ -114,9 +113,7 @@ class FrameTracer:
         That is what lies around occupied cells. Where matter is not few cells but haze, rays see little of it: some of
         them are followed ahead as far as they come, and what they want is filled.
         """
-        around = self.deformation.vertices_around(self.grid.occupancy, self.grid.aabb)
-        if len(around) <= VERTICES_PER_RAY * len(rays):
-            self.deformation.fill(around)
+        if self.deformation.fill_around(self.grid, len(rays)):
             return
         fresh = numbers == 0
         is_ahead = fresh & (torch.arange(len(rays), device=states.device) % PIONEERS == 0)

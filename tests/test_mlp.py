@@ -100,3 +100,22 @@ def test_activation_is_its_formula(activation: str, formula: Callable[[Tensor], 
 def test_unknown_activation_is_refused() -> None:
     with pytest.raises(ValueError, match="activation must be one of relu, silu, softplus; got 'tanh'"):
         MLP(3, 5, 4, activation="tanh")
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"skips": (1,)}, {"activation": "silu"}, {"num_layers": 0}, {"num_layers": 0, "out_features": None}]
+)
+def test_inputs_that_lack_are_zero_and_scales_multiply(options: dict) -> None:
+    mlp = MLP(**{"in_features": 5, "hidden_features": 8, "num_layers": 3, "out_features": 2, **options}).double()
+    inputs, scale = torch.randn(7, 3, dtype=torch.float64), torch.tensor([0.0, 0.5, 2.0], dtype=torch.float64)
+    whole = torch.nn.functional.pad(inputs * scale, (0, 2)).requires_grad_()
+    inputs.requires_grad_()
+    found, expected = mlp(inputs, scale), mlp(whole)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    mine, theirs = (
+        torch.autograd.grad(output.square().sum(), [start, *mlp.parameters()], allow_unused=True)
+        for output, start in ((found, inputs), (expected, whole))
+    )
+    torch.testing.assert_close(mine[0], theirs[0][:, :3] * scale, rtol=1e-12, atol=1e-12)
+    for left, right in zip(mine[1:], theirs[1:], strict=True):
+        torch.testing.assert_close(left, right, rtol=1e-12, atol=1e-12)

@@ -101,6 +101,11 @@ def test_packed_samples_are_chosen_from_ray_by_ray() -> None:
     assert replace(kept, ray_offsets=None).offsets.tolist() == kept.offsets.tolist()
     none = packed.kept(torch.zeros(5, dtype=torch.bool))
     assert none.offsets.tolist() == [0] * 5
+    last = packed.chosen(torch.tensor([0, 4]))
+    assert last.ends.tolist() == [1, 5]
+    assert last.ray_indices is not None
+    assert last.ray_indices.tolist() == [0, 3]
+    assert last.offsets.tolist() == [0, 1, 1, 1, 2]
 
 
 @given(st.integers(1, 5))

@@ -322,7 +322,7 @@ def test_the_field_is_asked_in_parts_where_there_is_much_to_ask(monkeypatch: pyt
     field, sampler = CountingFog(0.5), OccupancySampler(BOX, 0.06, splits=3)
     pictures = []
     for most in (1 << 18, 1000):
-        monkeypatch.setattr("dnerf.renderer.MOST_AT_ONCE", most)
+        monkeypatch.setattr("dnerf.fields.base.MOST_AT_ONCE", most)
         pictures.append(Renderer(field, sampler, stop_transmittance=1e-6).render_image(some_camera(21, 17), 0.5))
     assert torch.equal(pictures[0].rgb, pictures[1].rgb)
     assert field.most_at_once <= 1000

@@ -106,7 +106,7 @@ def test_it_shows_what_the_chain_shows(time_terms: int, splits: int) -> None:
 
 @pytest.mark.parametrize("ahead", [0, 100])
 def test_rays_that_meet_carried_bodies_are_left_to_the_field(ahead: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dnerf.tracing.VERTICES_PER_RAY", ahead)
+    monkeypatch.setattr("dnerf.deformations.frame_lattice.VERTICES_PER_RAY", ahead)
     bodies = CarriedBodies(2, 3)
     bodies.add(torch.tensor([[-0.3, 0.0, 0.1], [0.2, 0.1, 0.0], [0.3, 0.0, 0.1]]), torch.tensor([0.8, 0.8, 0.8]), 0.12)
     bodies.add(torch.full((3, 3), NOWHERE), torch.tensor([0.1, -0.2, -0.3]), 0.1)  # it is not there
@@ -138,11 +138,11 @@ def test_rays_that_meet_carried_bodies_are_left_to_the_field(ahead: int, monkeyp
 def test_what_is_filled_ahead_is_most_of_it_and_changes_nothing(
     asked: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dnerf.tracing.VERTICES_PER_RAY", 100)  # all around occupied cells
+    monkeypatch.setattr("dnerf.deformations.frame_lattice.VERTICES_PER_RAY", 100)  # all around occupied cells
     ahead = picture(model(splits=3))
     assert asked[0] > 0.9 * sum(asked)
     asked.clear()
-    monkeypatch.setattr("dnerf.tracing.VERTICES_PER_RAY", 0)  # rays find what they want
+    monkeypatch.setattr("dnerf.deformations.frame_lattice.VERTICES_PER_RAY", 0)  # rays find what they want
     torch.testing.assert_close(ahead, picture(model(splits=3)), rtol=0, atol=1e-6)
     assert asked[0] < 0.9 * sum(asked)
 

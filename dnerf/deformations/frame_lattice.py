@@ -8,9 +8,10 @@ from torch import Tensor
 
 from dnerf.checks import as_box, check_positive
 from dnerf.deformations.base import Deformation, check_positions_times
-from dnerf.kernels import GridLevels, covered_places, few_nonzero, grid_encode
+from dnerf.kernels import GridLevels, MarchGrid, covered_places, few_nonzero, grid_encode
 
 LEAST_ROWS = 256  # fewer take matrix libraries as long
+VERTICES_PER_RAY = 4  # most to ask around all occupied cells, instead of finding out which of them rays want
 
 Additions = Callable[[Tensor, Tensor], Tensor]
 """Four numbers (M, 4) of canonical positions (M, 3) at times (M,)."""
@@ -119,8 +120,12 @@ class FrozenDeformation(Deformation):
         self.move_to(positions.device)
         points = positions.reshape(-1, 3)
         unit = (points - self.low.to(points.dtype)) / self.sides.to(points.dtype)
-        self._fill(unit)
-        moved = points + grid_encode(unit, self.displacements, self.levels)[:, :3].to(points.dtype)
+        displacements = grid_encode(unit, self.displacements, self.levels)[:, :3]
+        lacks = displacements[:, 0].isnan()
+        if bool(lacks.any()):
+            self._fill(unit[lacks])
+            displacements[lacks] = grid_encode(unit[lacks], self.displacements, self.levels)[:, :3]
+        moved = points + displacements.to(points.dtype)
         low, high = unit.aminmax()
         if not bool((low >= 0) & (high <= 1)):
             rest = ~((unit >= 0) & (unit <= 1)).all(-1)
@@ -146,6 +151,23 @@ class FrozenDeformation(Deformation):
             length = needed.shape[axis] - 1
             needed.narrow(axis, 1, length).logical_or_(needed.narrow(axis, 0, length).clone())
         self.fill(few_nonzero(needed & ~self.is_known))
+
+    def fill_around(self, grid: MarchGrid, num_rays: int) -> bool:
+        """Fill what rays through a grid's occupied cells will want at once, since every round of asking has its price.
+
+        Args:
+            grid: with the cells.
+            num_rays: that will come. Where matter is not few cells but haze, rays see little of it.
+
+        Returns:
+            Whether it was filled: not if that is more than `VERTICES_PER_RAY` vertices for each ray.
+        """
+        self.move_to(grid.occupancy.device)
+        around = self.vertices_around(grid.occupancy, grid.aabb)
+        if len(around) > VERTICES_PER_RAY * num_rays:
+            return False
+        self.fill(around)
+        return True
 
     @torch.no_grad()
     def vertices_around(self, occupied: Tensor, aabb: Tensor) -> Tensor:

@@ -2,9 +2,12 @@
 
 from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor, nn
 
 from dnerf.compositing import FieldOutput
+
+MOST_AT_ONCE = 1 << 17  # places that `ask` asks in one go: bounds the memory, in haze
 
 
 class RadianceField(nn.Module, ABC):
@@ -100,3 +103,21 @@ class RadianceField(nn.Module, ABC):
             extent: (2, 3) box in world units beyond which it will hardly be asked, if that is known.
         """
         return self
+
+
+def ask(field: RadianceField, positions: Tensor, directions: Tensor, times: Tensor, *, pad_to: int = 1) -> FieldOutput:
+    """Density (N,) and rgb (N, 3) of a field, asked at most `MOST_AT_ONCE` places at a time, without extras.
+
+    Args:
+        field: what is asked.
+        positions, directions, times: (N, 3), (N, 3), (N,), see `RadianceField.forward`.
+        pad_to: a multiple of so many places is asked: matrix libraries compile code for every new number of rows.
+    """
+    count = len(times)
+    padding = -count % pad_to if count else 0
+    padded = [
+        torch.cat([x, x[-1:].expand(padding, *x.shape[1:])]) if padding else x for x in (positions, directions, times)
+    ]
+    parts = [field(*part) for part in zip(*(x.split(MOST_AT_ONCE) for x in padded), strict=True)]
+    density, rgb = (torch.cat(x) if len(x) > 1 else x[0] for x in zip(*((p.density, p.rgb) for p in parts)))
+    return FieldOutput(density[:count], rgb[:count])

@@ -145,11 +145,13 @@ class DeformedField(RadianceField):
         return self._like(field)
 
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
-        """The same with the deformation kept on the lattice, if there is one and anything moves."""
-        if self.frame_lattice is None or isinstance(self.deformation, IdentityDeformation):
+        """The same with both parts at that time; the deformation on the lattice, if there is one and anything moves."""
+        deformation, canonical = self.deformation, self.canonical.at_time(time, None)
+        if self.frame_lattice is not None and not isinstance(deformation, IdentityDeformation):
+            deformation = self.frame_lattice.at_time(deformation, time, extent)
+        if deformation is self.deformation and canonical is self.canonical:
             return self
-        frozen = self.frame_lattice.at_time(self.deformation, time, extent)
-        return self._like(DeformedField(frozen, self.canonical, bodies=self.bodies))
+        return self._like(DeformedField(deformation, canonical, bodies=self.bodies))
 
     def _like(self, field: "DeformedField") -> "DeformedField":
         """Another field in this one's mode; its parts, which may be shared, keep theirs."""

@@ -130,26 +130,23 @@ class GridField(RadianceField):
         opened = (len(levels) - 1) * min(progress / self.window_end, 1.0) - levels + 1
         self.window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))
 
-    def _features(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """What the head sees, without `space_time`."""
+    def _inputs(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """What the head sees (..., n), and the scale (n,) of each column; without times, that without `space_time`."""
         unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
         features = grid_encode(unit.reshape(-1, 3), self.table, self.levels)
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
-        if self.window_end is not None:
-            features = features * self.window.repeat_interleave(self.table.shape[1]).to(features.dtype)
+        scale = None if self.window_end is None else self.window.repeat_interleave(self.table.shape[1])
         if self.encode_times is not None:
             assert times is not None
-            features = torch.cat([features, self.encode_times(times[..., None])], dim=-1)
-        return features
+            features, scale = _joined(features, scale, self.encode_times(times[..., None]))
+        if times is None or not self._sees_space_time:
+            return features, scale
+        assert self.space_time is not None
+        return _joined(features, scale, self.space_time(positions, times))
 
     def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
         """The head's outputs; without times, those without `space_time`."""
-        features = self._features(positions, times)
-        if self.space_time is None:
-            return self.head(features)
-        if times is None or not self._sees_space_time:
-            return self.head(nn.functional.pad(features, (0, self.space_time.out_features)))
-        return self.head(torch.cat([features, self.space_time(positions, times)], dim=-1))
+        return self.head(*self._inputs(positions, times))
 
     def _activated(self, raw: Tensor) -> Tensor:
         return activate_density(raw, self.density_activation, self.density_shift)
@@ -176,6 +173,10 @@ class GridField(RadianceField):
             return None
         return self._waves(torch.tensor(time, device=self.orders.device)), self.density_shift
 
+    def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
+        """The same with its series summed up, if it has any and sees no directions."""
+        return self if self.time_terms == 1 or not self.num_contents else GridFieldAtTime(self, time)
+
     def contents(self, positions: Tensor) -> Tensor:
         """The head's outputs (..., 4 K) at canonical positions (..., 3), `space_time` unseen."""
         if not self.num_contents:
@@ -195,12 +196,14 @@ class GridField(RadianceField):
             return super().changes(positions, times)
         check_positions_times(positions, times)
         assert self.space_time is not None
-        features, seen = self._features(positions, None), self.space_time(positions, times)
-        with_it, without = (self.head(torch.cat([features, x], dim=-1)) for x in (seen, torch.zeros_like(seen)))
-        return self._at(with_it, times) - self._at(without, times)
+        features, scale = self._inputs(positions, None)
+        with_it = self.head(*_joined(features, scale, self.space_time(positions, times)))
+        return self._at(with_it, times) - self._at(self.head(features, scale), times)
 
     def _shown(self, series: Tensor, times: Tensor) -> FieldOutput:
-        values = self._at(series, times)
+        return self._activated_values(self._at(series, times))
+
+    def _activated_values(self, values: Tensor) -> FieldOutput:
         density = self._activated(values[..., 0])
         return FieldOutput(density=density, rgb=torch.sigmoid(values[..., 1:].to(density.dtype)))
 
@@ -219,6 +222,44 @@ class GridField(RadianceField):
         features = torch.relu(raw[..., self.time_terms :])
         colors = self.to_rgb(torch.cat([features, self.encode_directions(directions)], dim=-1))
         return self._shown(torch.cat([raw[..., : self.time_terms], colors], dim=-1), times)
+
+
+class GridFieldAtTime(RadianceField):
+    """A grid field at one time, for pictures: its series are summed up in the head's last layer, not at every sample.
+
+    Args:
+        field: what is asked, with contents that change with time; `space_time` is seen.
+        time: in [0, 1]; the only one at which it may be asked.
+    """
+
+    def __init__(self, field: GridField, time: float) -> None:
+        super().__init__()
+        last = field.head.output
+        if not field.num_contents or last is None:
+            raise ValueError("field must have contents, got one whose head sees times or directions")
+        waves = field._waves(field.low.new_tensor(time)).to(last.weight.dtype)
+        self.field = field
+        self.register_buffer("weight", torch.einsum("ckh,k->ch", last.weight.detach().unflatten(0, (4, -1)), waves))
+        self.register_buffer("bias", last.bias.detach().unflatten(0, (4, -1)) @ waves)
+        self.weight: Tensor
+        self.bias: Tensor
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Density (...,) at canonical positions (..., 3) and times (...,)."""
+        return self(positions, positions, times).density
+
+    @torch.no_grad()
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and times (...,)."""
+        check_positions_times(positions, times)
+        seen = self.field.head.before_output(*self.field._inputs(positions, times))
+        return self.field._activated_values(nn.functional.linear(seen, self.weight, self.bias))
+
+
+def _joined(features: Tensor, scale: Tensor | None, more: Tensor) -> tuple[Tensor, Tensor | None]:
+    """More columns (..., m), of scale 1, behind others."""
+    scale = None if scale is None else nn.functional.pad(scale, (0, more.shape[-1]), value=1)
+    return torch.cat([features, more], dim=-1), scale
 
 
 @torch.no_grad()

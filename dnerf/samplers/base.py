@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.cameras import Camera
-from dnerf.fields.base import RadianceField
+from dnerf.compositing import FieldOutput
+from dnerf.fields.base import RadianceField, ask
 from dnerf.kernels import MarchGrid
 from dnerf.rays import Rays, Samples
 
@@ -42,7 +43,7 @@ class Sampler(nn.Module, ABC):
 
     def refined(
         self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
-    ) -> Samples:
+    ) -> tuple[Samples, FieldOutput]:
         """In evaluation mode, where the field is asked for what is seen of the samples that `first` placed.
 
         Args:
@@ -53,9 +54,10 @@ class Sampler(nn.Module, ABC):
             min_weight: what has less of a share in the picture may be left out.
 
         Returns:
-            Packed samples of the same rays, in the same intervals; those themselves unless overridden.
+            Packed samples of the same rays, in the same intervals, and what the field says there, without extras;
+            those themselves unless overridden.
         """
-        return samples
+        return samples, ask(field, *samples.locate(rays))
 
     def seen_rays(self, camera: Camera, time: float) -> tuple[Tensor, Rays] | None:
         """Pixels of a view in whose rays this sampler may place samples in evaluation mode; all unless overridden.

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from dnerf.cameras import Camera
 from dnerf.checks import check_positive
-from dnerf.compositing import render_weights
-from dnerf.fields.base import RadianceField
+from dnerf.compositing import FieldOutput, render_weights
+from dnerf.fields.base import RadianceField, ask
 from dnerf.kernels import MarchGrid, footprints, march, march_to_size
-from dnerf.rays import Rays, Samples
+from dnerf.rays import Rays, Samples, parts_of
 from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.samplers.visibility import joined, visible_weights
 
@@ -158,15 +158,26 @@ class OccupancySampler(OccupancyGrid):
     @torch.no_grad()
     def refined(
         self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
-    ) -> Samples:
-        """The intervals above `min_weight`, those above `split_weight` split; as they are, if pictures split none."""
+    ) -> tuple[Samples, FieldOutput]:
+        """The intervals above `min_weight`, those above `split_weight` split; as they are, if pictures split none.
+
+        What is known is not asked again: whole intervals, and parts in whose middle their interval's is.
+        """
+        known = ask(field, *samples.locate(rays))
         if self.render_splits == 1:
-            return samples
-        positions, _, times = samples.locate(rays)
-        optical_depth = field.density(positions, times) * samples.lengths
-        weights = render_weights(optical_depth, samples) * samples.per_sample(transmittance)
-        is_seen = ~(weights <= min_weight)  # NaN is
-        return self._split(samples.kept(is_seen), weights[is_seen], self.render_splits).padded(self.pad_to)
+            return samples, known
+        weights = render_weights(known.density * samples.lengths, samples) * samples.per_sample(transmittance)
+        seen = (~(weights <= min_weight)).nonzero()[:, 0]  # NaN is
+        counts = self._counts(weights.index_select(0, seen), self.render_splits)
+        parts = samples.chosen(seen).split(counts)
+        whole, number = parts_of(counts)
+        density, rgb = (x.index_select(0, seen[whole]) for x in (known.density, known.rgb))
+        new = (2 * number + 1 != counts[whole]).nonzero()[:, 0]
+        if len(new):
+            positions, directions, times = (x.index_select(0, new) for x in parts.locate(rays))
+            asked = ask(field, positions, directions, times, pad_to=self.pad_to)
+            density[new], rgb[new] = asked.density, asked.rgb
+        return parts, FieldOutput(density, rgb)
 
     def fix_sizes(self, marched: int | None, kept: int | None = None) -> None:
         """In training, place samples by `to_size` from now on, in so many places; None for no more."""
@@ -218,13 +229,17 @@ class OccupancySampler(OccupancyGrid):
         weights = render_weights(density * samples.lengths, samples)
         splits = self.training_splits if self.training else self.render_splits
         is_seen = ~(weights <= min_weight) if min_weight else torch.ones_like(weights, dtype=torch.bool)
-        counts = torch.where(weights <= self.split_weight, 1, splits) * (is_seen & (samples.lengths > 0))  # NaN is
+        counts = self._counts(weights, splits) * (is_seen & (samples.lengths > 0))  # NaN is
         samples, num_wanted = samples.fitted(counts, kept)
         return samples, torch.stack([num_marched, num_wanted])
 
     def _split(self, samples: Samples, weights: Tensor, count: int) -> Samples:
         """Samples of which those whose weight exceeds `split_weight` are cut into so many parts."""
-        return samples if count == 1 else samples.split(torch.where(weights <= self.split_weight, 1, count))
+        return samples if count == 1 else samples.split(self._counts(weights, count))
+
+    def _counts(self, weights: Tensor, most: int) -> Tensor:
+        """Into how many parts intervals of such weights are cut, int64."""
+        return torch.where(weights <= self.split_weight, 1, most)
 
     def _march(self, rays: Rays, jitter: Tensor, most: int | None = None) -> Samples:
         occupied, skips = self.looked_into(self.is_narrow or not self.training)

@@ -6,7 +6,9 @@ from torch import Tensor
 
 from dnerf.cameras import Camera, Intrinsics, look_at
 from dnerf.deformations import Deformation, DisplacementDeformation, FrameLattice, IdentityDeformation
+from dnerf.deformations.frame_lattice import VERTICES_PER_RAY
 from dnerf.fields import DeformedField, GridField
+from dnerf.kernels import MarchGrid, skip_distances
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, StratifiedSampler
 
@@ -84,6 +86,26 @@ def test_vertices_around_cells_are_those_that_points_in_them_ask_for() -> None:
     assert torch.equal(found, asked.is_known.view(-1).nonzero()[:, 0])
     assert not len(asked.vertices_around(occupied, aabb))  # they are known
     assert not len(lattice.at_time(IdentityDeformation(), 0.5).vertices_around(occupied & False, aabb))
+
+
+def test_what_rays_will_want_is_filled_at_once_unless_it_is_too_much() -> None:
+    occupied = torch.zeros(7, 5, 6, dtype=torch.bool)
+    occupied[2:4, 1, 3:5] = True
+    grid = MarchGrid(occupied, skip_distances(occupied[None])[0], torch.tensor(BOX), 0.02, 1, 0.0)
+    lattice = FrameLattice(BOX, 12)
+    bend = Bend()
+    frozen = lattice.at_time(bend, 0.5)
+    wanted = len(frozen.vertices_around(occupied, grid.aabb))
+    assert not frozen.fill_around(grid, (wanted - 1) // VERTICES_PER_RAY)
+    assert not bend.num_points
+    assert frozen.fill_around(grid, -(-wanted // VERTICES_PER_RAY))
+    asked = bend.num_points
+    low, high = torch.lerp(*torch.tensor(BOX), torch.tensor([[2, 1, 3], [4, 2, 5]]) / torch.tensor([7, 5, 6]))
+    x = torch.lerp(low + 1e-4, high - 1e-4, torch.rand(200, 3))
+    torch.testing.assert_close(
+        frozen(x, torch.full((200,), 0.5)), Bend()(x, torch.full((200,), 0.5)), atol=0.01, rtol=0
+    )
+    assert bend.num_points == asked
 
 
 def test_outside_its_box_the_deformation_itself_is_asked() -> None:

@@ -114,6 +114,20 @@ def test_density_alone_equals_that_of_the_whole_output(name: str) -> None:
     assert torch.equal(field.density(positions, times), field(positions, directions, times).density)
 
 
+@every_field
+def test_the_field_of_one_time_is_the_field_at_that_time(name: str) -> None:
+    field = trained(name, torch.float64)
+    positions, directions, times = some_points(100, dtype=torch.float64)
+    for time in (0.0, 0.37, 1.0):
+        times.fill_(time)
+        with torch.no_grad():
+            expected, frozen = field(positions, directions, times), field.at_time(time)
+        output = frozen(positions, directions, times)
+        torch.testing.assert_close(output.density, expected.density, rtol=1e-9, atol=0)
+        torch.testing.assert_close(output.rgb, expected.rgb, rtol=1e-9, atol=0)
+        torch.testing.assert_close(frozen.density(positions, times), expected.density, rtol=1e-9, atol=0)
+
+
 @pytest.mark.parametrize("name", VIEW_INDEPENDENT)
 def test_view_independent_fields_ignore_directions(name: str) -> None:
     field = trained(name)

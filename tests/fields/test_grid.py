@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dnerf.fields import GridField
+from dnerf.fields.grid import GridFieldAtTime
 
 BOX = [[-1.0, 0.0, 2.0], [1.0, 1.0, 6.0]]
 
@@ -133,3 +134,37 @@ def test_the_window_is_saved_with_the_field() -> None:
 def test_a_window_outside_the_training_is_refused(end: float) -> None:
     with pytest.raises(ValueError, match=r"window_end must be in \(0, 1\]"):
         small(window_end=end)
+
+
+def test_series_are_summed_up_for_pictures_where_there_are_any() -> None:
+    for options in ({}, {"time_terms": 3, "view_degree": 1}, {"time_terms": 3, "time_frequencies": 2}):
+        field = small(**options)
+        assert field.at_time(0.3) is field
+    frozen = small(time_terms=3).at_time(0.3)
+    assert isinstance(frozen, GridFieldAtTime)
+    assert frozen.weight.shape == (4, 16)  # of the head's sixteen to density and colour, not to 4 x 3 terms
+    with pytest.raises(ValueError, match="must have contents"):
+        GridFieldAtTime(small(view_degree=1), 0.3)
+
+
+def test_levels_that_are_not_in_yet_are_not_seen() -> None:
+    """Tables of closed levels neither show nor learn; half-open ones count half."""
+    field = small(window_end=1.0)
+    positions, times = torch.rand(50, 3) + torch.tensor([0.0, 0.0, 3.0]), torch.zeros(50)
+    fine = field.levels.offsets[1]
+    field.set_progress(0.5)
+    assert 0.1 < float(field.window[1]) < 0.9
+    half = field.density(positions, times)
+    with torch.no_grad():
+        field.table[fine:] *= field.window[1]
+    field.set_progress(1.0)
+    torch.testing.assert_close(field.density(positions, times), half)
+    field.set_progress(0.0)
+    field.density(positions, times).sum().backward()
+    assert field.table.grad is not None
+    assert not field.table.grad[fine:].any()
+    assert field.table.grad[:fine].any()
+    with torch.no_grad():
+        closed = field.density(positions, times)
+        field.table[fine:] = 7.0
+        assert torch.equal(field.density(positions, times), closed)

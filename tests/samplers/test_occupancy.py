@@ -173,6 +173,42 @@ def test_pictures_ask_where_something_is_seen_at_short_intervals() -> None:
     assert difference.mean() < 0.01
 
 
+@pytest.mark.parametrize("splits", [2, 3, 4])
+@pytest.mark.parametrize("split_weight", [0.0, 0.04])
+def test_what_is_known_of_parts_is_not_asked_again(splits: int, split_weight: float) -> None:
+    """What comes back is what the field says at the middles of all parts; asked are those that are new."""
+
+    class Fog(RadianceField):
+        asked: list[Tensor] = []
+
+        def density(self, positions: Tensor, times: Tensor) -> Tensor:
+            return 3 * torch.exp(positions[..., 0])
+
+        def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+            self.asked.append(positions)
+            return FieldOutput(self.density(positions, times), torch.sigmoid(positions))
+
+    rays = rays_towards_origin(40)
+    sampler, field = small(splits=splits, split_weight=split_weight).eval(), Fog()
+    first, light = sampler.first(rays, 30), torch.linspace(0.1, 1, 40)
+    assert first is not None
+    Fog.asked = []
+    parts, output = sampler.refined(first, rays, field, light, 0.01)
+    places = parts.positions(rays)
+    torch.testing.assert_close(output.density, field.density(places, places[:, 0]), rtol=1e-5, atol=0)
+    torch.testing.assert_close(output.rgb, torch.sigmoid(places), rtol=0, atol=1e-6)
+    weights = render_weights(field.density(first.positions(rays), light) * first.lengths, first)
+    weights = weights * first.per_sample(light)
+    num_split = int((weights > max(split_weight, 0.01)).sum())
+    num_whole = int((weights > 0.01).sum()) - num_split
+    assert num_split > 50
+    assert (num_whole > 50) == (split_weight > 0)
+    assert len(parts.starts) == num_split * splits + num_whole
+    assert len(Fog.asked[0]) == len(first.starts)
+    assert len(Fog.asked[1]) == num_split * (splits - splits % 2)  # the middle of three parts is known
+    assert len(Fog.asked) == 2
+
+
 def test_cells_can_be_set() -> None:
     sampler = small(render_margin=0)
     sampler.occupy(torch.tensor(False))
