@@ -112,12 +112,13 @@ class BodySearch:
         bodies.set_searched()
         if any(isinstance(part, SpaceTimeVolumes) and part.has_joined for part in renderer.modules()):
             return False
-        times, order = frames.times.sort(stable=True)
-        seen = self.sightings(frames, error_map)
+        times = frames.times.cpu()
+        chosen = one_of_each_moment(times)
+        times, sightings = times[chosen], self.sightings(frames, error_map)
         tolerance = self.tolerance * float((self.box[1] - self.box[0]).amax())
         search = PathSearch(self.box.tolist(), tolerance)
-        paths = search([seen[i] for i in order.tolist()], times.tolist())
-        spacing = float(times.unique().diff().median()) if len(paths) else 0.0
+        paths = search([sightings[number] for number in chosen], times.tolist())
+        spacing = float(times.diff().median()) if len(paths) else 0.0
         found = joined_bodies(fast_bodies(paths, self.min_speed), spacing)
         room = len(bodies.radii) - bodies.num_bodies
         tracks = [
@@ -237,6 +238,13 @@ class BodySearch:
         places = bodies.centers(number, times) + bodies.radii[number] * (directions * unit).to(device)
         is_inside = ((places >= self.box[0].to(device)) & (places <= self.box[1].to(device))).all(-1)
         return places[is_inside], times[is_inside]
+
+
+def one_of_each_moment(times: Tensor) -> list[int]:
+    """Frames of all different times (F,), in order; where several cameras see one moment, another one for the next."""
+    moments, numbers = times.unique(return_inverse=True)
+    frames = [(numbers == number).nonzero()[:, 0].tolist() for number in range(len(moments))]
+    return [some[number % len(some)] for number, some in enumerate(frames)]
 
 
 def bodies_of(renderer: Renderer) -> CarriedBodies | None:

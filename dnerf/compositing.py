@@ -62,6 +62,17 @@ class Rendering:
     output: FieldOutput | None = None
     proposals: "tuple[Rendering, ...]" = ()
 
+    @property
+    def is_placed(self) -> Tensor | None:
+        """(R,) bool, the rays that found places for their samples; None for all of them. See `Samples`."""
+        return None if self.samples is None else self.samples.is_placed
+
+    def mean(self, values: Tensor) -> Tensor:
+        """The mean () of values (R,) over the rays that found places: of others the picture says nothing."""
+        if self.is_placed is None:
+            return values.mean()
+        return torch.where(self.is_placed, values, 0).sum() / self.is_placed.sum().clamp(min=1)
+
 
 def _at_least_float32(values: Tensor) -> Tensor:
     return values.float() if values.dtype in (torch.float16, torch.bfloat16) else values

@@ -8,7 +8,7 @@ from dnerf.data.frames import Frames
 from dnerf.time_window import TimeWindow
 
 UNSEEN = 1.0  # as wrong as colours can be
-LEAST = 1e-6  # so that something can be drawn where nothing is wrong
+LEAST, MOST = 1e-6, 1 - 1e-6  # that a seen block knows: something can be drawn where nothing is wrong
 
 
 class ErrorMap(nn.Module):
@@ -84,17 +84,20 @@ class ErrorMap(nn.Module):
 
     @torch.no_grad()
     def learn(self, indices: Tensor, errors: Tensor) -> None:
-        """Enter the squared errors (R,) of pixels (R,); one that is no number counts as never seen."""
+        """Enter the squared errors (R,) of pixels (R,).
+
+        One that is no number counts as never seen, a negative one as not drawn.
+        """
         height, width = self.size
         frames, rows, columns = indices // (height * width), indices // width % height, indices % width
         blocks = (frames * self.errors.shape[1] + rows // self.block) * self.errors.shape[2] + columns // self.block
         known = self.errors.view(-1)
-        errors = torch.where(errors < UNSEEN, errors, UNSEEN).to(known.dtype).clamp(min=LEAST)
-        sums, counts = (
-            torch.zeros_like(known).index_add_(0, blocks, each) for each in (errors, torch.ones_like(errors))
-        )
-        before, now = known[blocks], sums[blocks] / counts[blocks]
-        known[blocks] = torch.where(before < UNSEEN, torch.lerp(now, before, self.memory), now)
+        is_shown = (~(errors < 0)).to(known.dtype)  # NaN is
+        errors = torch.where(errors <= 1, errors.clamp(LEAST, MOST), UNSEEN).to(known.dtype)
+        sums, counts = (torch.zeros_like(known).index_add_(0, blocks, each) for each in (errors * is_shown, is_shown))
+        before, now = known[blocks], sums[blocks] / counts[blocks].clamp(min=1)
+        now = torch.where(before < UNSEEN, torch.lerp(now, before, self.memory), now)
+        known[blocks] = torch.where(counts[blocks] > 0, now, before)
 
     def _within(self, blocks: Tensor, unit: Tensor, side: int) -> Tensor:
         """Random rows or columns of blocks; the last block may be cut."""

@@ -49,6 +49,19 @@ def spread(wanted: Tensor, size: int) -> tuple[Tensor, Tensor]:
     return filled, before + number * left // len(wanted)
 
 
+def placed(rays: Tensor, is_filled: Tensor, num_rays: int, wanted: Tensor) -> Tensor:
+    """Which rays (R,) got what they wanted of S places: if that was too much, those up to the last that got any.
+
+    Args:
+        rays: (S,) int64, the ray of each place.
+        is_filled: (S,) bool.
+        num_rays: R.
+        wanted: () int64, places that all rays would have filled.
+    """
+    last = torch.where(is_filled, rays, -1).amax()
+    return (wanted <= len(rays)) | (torch.arange(num_rays, device=rays.device) <= last)
+
+
 def fit(offsets: Tensor, counts: Tensor, size: int) -> Fit:
     """Put packed samples, each any number of times, into a fixed number of places.
 

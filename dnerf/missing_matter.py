@@ -32,6 +32,8 @@ def lacking_opacity(rendering: Rendering, rgba: Tensor, *, has_alpha: bool, num_
     """
     background = 0.0 if rendering.background is None else rendering.background.detach()
     needed = rgba[:, 3] if has_alpha else (rgba[:, :3] - background).abs().amax(-1)
+    if rendering.is_placed is not None:
+        needed = torch.where(rendering.is_placed, needed, 0)
     lacking = torch.where(rendering.opacity.detach() < needed / 2, needed, 0)
     return {name: x[:num_even].sum() / max(len(x), 1) for name, x in ((NEEDED, needed), (LACKING, lacking))}
 

@@ -70,27 +70,35 @@ class MLP(nn.Module):
             nn.init.zeros_(self.output.weight)
             nn.init.zeros_(self.output.bias)
 
-    def forward(self, inputs: Tensor, scale: Tensor | None = None) -> Tensor:
+    def forward(self, inputs: Tensor, scale: Tensor | None = None, *, num_lacking: int = 0) -> Tensor:
         """Map (..., in_features) -> (..., out_features).
 
         Args:
-            inputs: (..., n); those that lack, n < in_features, are the last ones, and count as 0.
-            scale: (n,), on each input; None for 1. A network without skips scales its weights instead.
+            inputs: (..., in_features - num_lacking).
+            scale: factor on each of them; None for 1. ReLU networks without skips scale their first weights instead.
+            num_lacking: how many inputs lack; they are the last ones, and count as 0.
+
+        Raises:
+            ValueError: for another number of inputs.
         """
-        x = self.before_output(inputs, scale)
+        x = self.before_output(inputs, scale, num_lacking=num_lacking)
         return x if self.output is None else self.output(x)
 
-    def before_output(self, inputs: Tensor, scale: Tensor | None = None) -> Tensor:
-        """Map (..., n) to what the last linear map sees, see `forward`."""
+    def before_output(self, inputs: Tensor, scale: Tensor | None = None, *, num_lacking: int = 0) -> Tensor:
+        """Map inputs to what the last linear map sees, see `forward`."""
+        if inputs.shape[-1] != self.in_features - num_lacking:
+            raise ValueError(f"inputs must have {self.in_features - num_lacking} columns, got {inputs.shape[-1]}")
         if self.hidden and not self.skips and self.activation is torch.relu_:
             layers = [cast(nn.Linear, layer) for layer in self.hidden]
             first, *others = (layer.weight for layer in layers)
-            first = first[:, : inputs.shape[-1]]
+            first = first[:, : inputs.shape[-1]] if num_lacking else first
             first = first if scale is None else first * scale.to(first.dtype)
             return relu_layers(inputs, [first, *others], [layer.bias for layer in layers])
         if scale is not None:
             inputs = inputs * scale.to(inputs.dtype)
-        x = inputs = nn.functional.pad(inputs, (0, self.in_features - inputs.shape[-1]))
+        if num_lacking:
+            inputs = nn.functional.pad(inputs, (0, num_lacking))
+        x = inputs
         for i, layer in enumerate(self.hidden):
             x = self.activation(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
         return x

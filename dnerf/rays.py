@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dnerf.checks import check_shape
-from dnerf.fixed_size import fit
+from dnerf.fixed_size import fit, placed
 
 if TYPE_CHECKING:
     from dnerf.compositing import FieldOutput
@@ -72,6 +72,7 @@ class Samples:
             Stratified sampling and Gauss quadrature set it.
         ray_offsets: packed only, (R + 1,) int64: samples of ray r are `ray_offsets[r]:ray_offsets[r + 1]`;
             derived from `ray_indices` if None.
+        is_placed: (R,) bool, the rays that found places, where these have a fixed number; None for all of them.
         proposals: earlier passes (coarse samples and what a field said there) that placed these samples;
             losses read them.
 
@@ -85,6 +86,7 @@ class Samples:
     ray_indices: Tensor | None = None
     points: Tensor | None = None
     ray_offsets: Tensor | None = None
+    is_placed: Tensor | None = None
     proposals: "tuple[tuple[Samples, FieldOutput], ...]" = ()
 
     def __post_init__(self) -> None:
@@ -98,6 +100,8 @@ class Samples:
             check_shape("points", self.points, self.starts.shape)
         if self.ray_offsets is not None:
             check_shape("ray_offsets", self.ray_offsets, (self.num_rays + 1,))
+        if self.is_placed is not None:
+            check_shape("is_placed", self.is_placed, (self.num_rays,))
 
     @property
     def is_packed(self) -> bool:
@@ -238,12 +242,14 @@ class Samples:
         chosen = fit(self.offsets, counts, size)
         starts, ends, parts = (x[chosen.source] for x in (self.starts, self.ends, counts.to(self.starts.dtype)))
         length = parts.clamp(min=1)
+        is_placed = placed(chosen.rays, chosen.is_filled, self.num_rays, chosen.wanted)
         samples = Samples(
             torch.where(chosen.is_filled, torch.lerp(starts, ends, chosen.part / length), 0),
             torch.where(chosen.is_filled, torch.lerp(starts, ends, (chosen.part + 1) / length), 0),
             self.num_rays,
             ray_indices=chosen.rays,
             ray_offsets=chosen.offsets,
+            is_placed=is_placed if self.is_placed is None else is_placed & self.is_placed,
         )
         return samples, chosen.wanted
 

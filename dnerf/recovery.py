@@ -36,8 +36,9 @@ def what_is_shown(rendering: Rendering, target: Tensor) -> dict[str, Tensor]:
         Two scalars named as in `SHOWN`: mean opacity, and mean largest difference of the truth from the background.
     """
     background = 0.0 if rendering.background is None else rendering.background
-    contrast = (target - background).detach().abs().amax(-1).mean()
-    return dict(zip(SHOWN, (rendering.opacity.detach().mean(), contrast), strict=True))
+    contrast = (target - background).detach().abs().amax(-1)
+    means = (rendering.mean(values) for values in (rendering.opacity.detach(), contrast))
+    return dict(zip(SHOWN, means, strict=True))
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,8 @@ class Renderer(nn.Module):
             positions, directions, times = samples.locate(rays)
             output = field(positions, directions, times)
         if self.training:
-            self.sampler.observe(positions.detach(), times, output.density.detach())
+            density = torch.where(samples.lengths > 0, output.density.detach(), 0)  # of padding: nothing
+            self.sampler.observe(positions.detach(), times, density)
         background = self.background(rays.directions, generator=generator)
         rendering = composite(samples, output, background, quadrature=self.quadrature)
         if not samples.proposals:

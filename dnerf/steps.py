@@ -85,8 +85,8 @@ class Steps:
 
         Returns:
             Scalars on the device: the terms whose turn it is, "loss", "mse" and what else was asked for; and the
-            squared errors (R,) of the pixels; they hold until the next step. And the number of samples; of a fixed
-            number of places, how many were wanted when that was last looked at.
+            squared errors (R,) of the pixels, -1 where a ray found no places; they hold until the next step. And the
+            number of samples; of a fixed number of places, how many were wanted when that was last looked at.
         """
         turns = [name for name in self.losses if number % self.loss_every.get(name, 1) == 0]
 
@@ -139,10 +139,11 @@ class Steps:
             (total * weight if weight != 1 else total).backward()
             self.optimizer.step()
         errors = (rendering.rgb.detach() - target).square().mean(-1)
+        known = errors if rendering.is_placed is None else torch.where(rendering.is_placed, errors, -1)
         shown = what_is_shown(rendering, target) if self.shows else {}
         if self.lacks:
             shown |= lacking_opacity(rendering, rgba, has_alpha=self.frames.has_alpha, num_even=num_even)
-        found = {"loss": total, **terms, "mse": errors.mean(), **shown, ERRORS: errors}
+        found = {"loss": total, **terms, "mse": rendering.mean(errors), **shown, ERRORS: known}
         return {name: values.detach() for name, values in found.items()}
 
 

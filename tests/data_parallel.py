@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from test_body_search import a_renderer, two_balls, wrong_where_matter_is
+from test_body_search import a_renderer, frames_of_two_balls, wrong_where_matter_is
 from torch import Tensor
 
 from dnerf.backgrounds import RandomBackground
@@ -73,7 +73,7 @@ class SeenAtOnce(BodySearch):
 def bodies() -> tuple[Renderer, dict[str, Any]]:
     """A fast ball is found, carried and learnt."""
     return a_renderer(), {
-        "frames": two_balls(), "num_rays": 64, "target_samples": 1500, "error_map": ErrorMap(resolution=24),
+        "frames": frames_of_two_balls(), "num_rays": 64, "target_samples": 1500, "error_map": ErrorMap(resolution=24),
         "body_search": SeenAtOnce(BOX, 0.3, min_steps=2),
     }  # fmt: skip
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 from other_device import Elsewhere, other_device
-from test_body_search import BOX, a_renderer, bodies_of, two_balls, wrong_where_matter_is
+from test_body_search import BOX, a_renderer, bodies_of, frames_of_two_balls, wrong_where_matter_is
 
 from dnerf.body_search import BodySearch
 from dnerf.training import Trainer
@@ -27,7 +27,7 @@ TINY = [
     "trainer.checkpoint_every=8", "trainer.progress_bar=false", "trainer.box_check.every=4",
     "trainer.missing_matter.share=1.0e-6", "trainer.missing_matter.every=1", "trainer.missing_matter.min_steps=4",
     "sampler.resolution=24", "sampler.num_probes=2048", "renderer.field.frame_lattice.resolution=16",
-    "renderer.field.baking.resolution=24",
+    "renderer.field.baking.resolution=24", "field.density_shift=-4",  # thin, so that matter is lacking
 ]  # fmt: skip
 SHORT_SEARCH = ["motion_search.num_steps=3", "motion_search.num_rays=200"]
 
@@ -72,7 +72,7 @@ def walk(experiment: str, folder: str) -> dict[str, int]:
 
 def carry_bodies(device: torch.device) -> dict[str, int | float]:
     """A fast ball is looked for and carried; then a few steps, with free and with fixed numbers of samples."""
-    frames = two_balls()
+    frames = frames_of_two_balls()
     found = {}
     for name, place in (("there", device), ("here", torch.device("cpu"))):
         renderer, pictures = a_renderer().to(place), frames.to(place)

@@ -12,6 +12,7 @@ from dnerf.backgrounds import RandomBackground
 from dnerf.body_search import BodySearch
 from dnerf.data import SyntheticData
 from dnerf.data.frames import Frames
+from dnerf.data.synthetic import random_views, render_frames
 from dnerf.deformations import CarriedBodies, DisplacementDeformation, FrameLattice, IdentityDeformation
 from dnerf.deformations.carried_bodies import NOWHERE
 from dnerf.error_map import ErrorMap
@@ -34,14 +35,18 @@ RED, BLUE = (0.9, 0.2, 0.1), (0.1, 0.2, 0.9)
 NUM_FRAMES = 80
 
 
-def two_balls() -> Frames:
+def two_balls() -> AnalyticScene:
     bodies = [Body(Ball(0.12), Plain(RED), FAST, 200.0), Body(Ball(0.12), Plain(BLUE), SLOW, 200.0)]
-    return SyntheticData(AnalyticScene(bodies, box=BOX), 48, num_train=NUM_FRAMES).frames("train")
+    return AnalyticScene(bodies, box=BOX)
+
+
+def frames_of_two_balls() -> Frames:
+    return SyntheticData(two_balls(), 48, num_train=NUM_FRAMES).frames("train")
 
 
 @pytest.fixture(scope="module")
 def frames() -> Frames:
-    return two_balls()
+    return frames_of_two_balls()
 
 
 def a_renderer(*, volumes: SpaceTimeVolumes | None = None, bodies: CarriedBodies | None = None) -> Renderer:
@@ -106,6 +111,19 @@ def test_the_fast_ball_is_carried_along_its_path_and_the_slow_one_is_not(frames:
         assert float(misses.median()) < 0.03
         is_known[is_there] |= misses < 0.08
     assert float(is_known.float().mean()) > 0.8
+
+
+def test_several_cameras_may_see_one_moment() -> None:
+    poses, _ = random_views(2 * NUM_FRAMES)
+    times = torch.linspace(0, 1, NUM_FRAMES).repeat(2)  # one camera's film after the other's
+    frames = render_frames(two_balls(), poses, times, 48)
+    renderer = a_renderer()
+    assert BodySearch(BOX)(300, renderer, frames, wrong_where_matter_is(frames))
+    bodies, times = bodies_of(renderer), times[:NUM_FRAMES]
+    centers = bodies.centers(0, times).detach()
+    is_there = centers.norm(dim=-1) < 3
+    assert float(is_there.float().mean()) > 0.8
+    assert float((centers - truth(FAST, times)).norm(dim=-1)[is_there].median()) < 0.03
 
 
 def test_homes_are_off_all_tracks_and_the_sampler_looks_along_these(searched: Renderer) -> None:

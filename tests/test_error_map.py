@@ -108,6 +108,26 @@ def test_an_error_that_is_none_counts_as_never_seen(error: float) -> None:
     assert error_map.errors[0, 0, 1] == 0.25
 
 
+@pytest.mark.parametrize("error", [1.0, 0.9999999])
+def test_what_is_as_wrong_as_can_be_has_been_seen(error: float) -> None:
+    error_map = begun(frames(1, 2, 2))
+    error_map.learn(torch.tensor([1]), torch.tensor([error]))
+    assert error < error_map.errors[0, 0, 1] + 1e-5
+    assert error_map.errors[0, 0, 1] < UNSEEN
+
+
+def test_rays_without_places_change_nothing() -> None:
+    pictures = frames(1, 4, 4)
+    error_map = begun(pictures, resolution=2, memory=0.5)
+    error_map.learn(torch.tensor([0, 2]), torch.tensor([0.5, 0.25]))
+    before = error_map.errors.clone()
+    error_map.learn(torch.tensor([0, 1, 2, 3, 15]), torch.tensor([-1.0, 0.1, -1.0, -1.0, -1.0]))
+    expected = before.clone()
+    expected[0, 0, 0] = 0.3  # of 0.5 and 0.1; the others as they were, the last one unseen
+    torch.testing.assert_close(error_map.errors, expected)
+    assert error_map.errors[0, 1, 1] == UNSEEN
+
+
 @given(
     size=st.tuples(st.integers(1, 4), st.integers(1, 23), st.integers(1, 23)),
     resolution=st.integers(1, 30),

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dnerf.fixed_size import fit, spread
+from dnerf.fixed_size import fit, placed, spread
 from dnerf.rays import Samples
 
 COUNTS = st.lists(st.lists(st.integers(0, 3), max_size=6), min_size=1, max_size=8)
@@ -84,3 +84,22 @@ def test_rays_that_do_not_fit_get_nothing() -> None:
 def test_what_cannot_be_fitted_is_refused(samples: Samples) -> None:
     with pytest.raises(ValueError, match="must be packed, some"):
         samples.fitted(torch.ones_like(samples.starts, dtype=torch.int64), 4)
+
+
+@given(wanted=st.lists(st.integers(0, 9), min_size=1, max_size=12), size=st.integers(1, 60))
+def test_rays_are_placed_unless_their_places_lacked(wanted: list[int], size: int) -> None:
+    """All of them if there is room; else none behind the last that got any: whether those wanted some is not known."""
+    counts = torch.tensor(wanted)
+    offsets = torch.arange(len(wanted) + 1)
+    chosen = fit(offsets, counts, size)
+    found = placed(chosen.rays, chosen.is_filled, len(wanted), chosen.wanted).tolist()
+    ends = counts.cumsum(0).tolist()
+    if ends[-1] <= size:
+        assert all(found)
+        return
+    for want, end, is_placed in zip(wanted, ends, found, strict=True):
+        if want:
+            assert is_placed == (end <= size)
+        elif end > size:
+            assert not is_placed
+    assert found == sorted(found, reverse=True)

@@ -110,7 +110,10 @@ def test_inputs_that_lack_are_zero_and_scales_multiply(options: dict) -> None:
     inputs, scale = torch.randn(7, 3, dtype=torch.float64), torch.tensor([0.0, 0.5, 2.0], dtype=torch.float64)
     whole = torch.nn.functional.pad(inputs * scale, (0, 2)).requires_grad_()
     inputs.requires_grad_()
-    found, expected = mlp(inputs, scale), mlp(whole)
+    found, expected = mlp(inputs, scale, num_lacking=2), mlp(whole)
+    for wrong, lacking in ((3, 0), (3, 1), (6, 0), (5, 2)):
+        with pytest.raises(ValueError, match=f"inputs must have {5 - lacking} columns, got {wrong}"):
+            mlp(torch.zeros(7, wrong, dtype=torch.float64), num_lacking=lacking)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
     mine, theirs = (
         torch.autograd.grad(output.square().sum(), [start, *mlp.parameters()], allow_unused=True)

@@ -318,6 +318,47 @@ def test_samplers_that_place_all_samples_at_once_split_them_once() -> None:
     torch.testing.assert_close(pictures[0].opacity, pictures[1].opacity, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("fixed", [False, True])
+def test_padding_is_not_observed_in_training(fixed: bool) -> None:
+    """Fog that is only at the cameras, beyond the box, where empty places of a fixed number of them lie."""
+
+    class Beyond(RadianceField):
+        def density(self, positions: Tensor, times: Tensor) -> Tensor:
+            return 50.0 * (positions.abs().amax(-1) > 1.5).to(positions.dtype)
+
+        def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+            return FieldOutput(self.density(positions, times), torch.sigmoid(positions))
+
+    sampler = OccupancySampler(BOX, 0.1, 16, pad_to=512)
+    before = sampler.maxima.clone()
+    if fixed:
+        sampler.fix_sizes(4096, 2048)
+    renderer = Renderer(Beyond(), sampler).train()
+    rendering = renderer(some_camera(5, 5).rays(0.5), generator=torch.Generator().manual_seed(0))
+    assert rendering.samples is not None
+    assert (rendering.samples.lengths == 0).any()
+    assert torch.equal(sampler.maxima <= 0.01, torch.ones_like(before, dtype=torch.bool))
+
+
+def test_what_is_no_number_shows_in_training_too() -> None:
+    """A filter that left it out would hide what is wrong, and the occupancy grid forget where matter is."""
+
+    class Broken(RadianceField):
+        def density(self, positions: Tensor, times: Tensor) -> Tensor:
+            return torch.where(positions[..., 0] > 0.3, math.nan, 5.0)
+
+        def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+            return FieldOutput(self.density(positions, times), torch.sigmoid(positions))
+
+    for fixed in (False, True):
+        sampler = OccupancySampler(BOX, 0.1, 16, min_weight=0.01)
+        if fixed:
+            sampler.fix_sizes(1 << 14, 1 << 14)
+        rendering = Renderer(Broken(), sampler).train()(some_camera(9, 9).rays(0.5))
+        assert rendering.rgb.isnan().any()
+        assert rendering.rgb.isfinite().any() or fixed  # whose empty places lie at the camera, where it is none either
+
+
 def test_the_field_is_asked_in_parts_where_there_is_much_to_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     field, sampler = CountingFog(0.5), OccupancySampler(BOX, 0.06, splits=3)
     pictures = []

@@ -1,6 +1,7 @@
 """Steps of a fixed size: nothing in them waits for a device, and they learn what other steps learn."""
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,14 +11,15 @@ from fixed_models import LOSSES, losses, small_renderer
 from recorded_graphs import RecordedCache, recorded_graphs
 
 from dnerf import kernels
-from dnerf.compositing import Rendering
+from dnerf.compositing import FieldOutput, Rendering
 from dnerf.data import Frames, SyntheticData
+from dnerf.fields import RadianceField
 from dnerf.graphs import GraphCache
 from dnerf.losses import Loss
 from dnerf.records import Callback, TrainingRecord
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder
-from dnerf.samplers import StratifiedSampler
+from dnerf.samplers import OccupancySampler, StratifiedSampler
 from dnerf.scenes import make_scene
 from dnerf.steps import LOOK_EVERY, ROUND_TO, Steps, next_num_rays, rays_that_fit
 from dnerf.training import Trainer
@@ -80,12 +82,50 @@ def test_a_step_waits_for_no_device(frames: Frames, splits: int, monkeypatch: py
     assert waits.found == []
 
 
+class Fog(RadianceField):
+    """Opaque and of one colour, which can be learnt."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.color = torch.nn.Parameter(torch.tensor([0.2, 0.5, 0.8]))
+
+    def density(self, positions: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(times, 1e4)
+
+    def forward(self, positions: torch.Tensor, directions: torch.Tensor, times: torch.Tensor) -> FieldOutput:
+        return FieldOutput(self.density(positions, times), self.color.expand(positions.shape))
+
+
+@pytest.mark.parametrize(("marched", "fixed"), [(8192, 4096), (8192, 40), (300, 4096)])
+def test_rays_without_places_are_not_taken_for_wrong_ones(marched: int, fixed: int) -> None:
+    """Pictures of opaque fog, which the model shows: nothing is wrong or lacking, whether there is room or not."""
+    pictures = SyntheticData(make_scene("walker"), 8, num_train=2).frames("train")
+    image = torch.tensor([51, 127, 204, 255], dtype=torch.uint8).expand(2, 8, 8, 4)
+    pictures = replace(pictures, images=image.contiguous())
+    renderer = Renderer(Fog(), OccupancySampler(((-9.0,) * 3, (9.0,) * 3), 0.3, 8, min_weight=0.01))
+    taken = steps(renderer, pictures, fixed=fixed)
+    taken.losses = {"rgb": losses()["rgb"]}
+    renderer.sampler.fix_sizes(marched, fixed)
+    found, errors, _ = taken(torch.arange(128), 1, 1.0, nullcontext)
+    is_known = errors >= 0
+    assert bool(is_known.all()) == (marched + fixed > 12000)
+    assert is_known[:2].all()
+    assert (errors[~is_known] == -1).all()
+    assert errors[is_known].max() < 1e-4
+    assert found["mse"] < 1e-4
+    assert found["needed opacity"] > 0.01
+    assert found["lacking opacity"] == 0
+    assert found["mean opacity"] > 0.99
+
+
 def test_an_update_waits_for_no_device(frames: Frames) -> None:
     renderer = small_renderer()
     probes = renderer.sampler.probes(16)
     assert probes is not None
     with kernels.use_backend("reference"), DeviceWaits() as waits:
-        renderer.field.density(probes[:, :3], probes[:, 3])  # the grid's definition makes tensors of its levels
+        renderer.field.density(
+            *(x.float() for x in (probes[:, :3], probes[:, 3]))
+        )  # the grid's definition makes tensors of its levels
         known = list(waits.found)
         renderer.learn(probes)
     assert waits.found == known * 2

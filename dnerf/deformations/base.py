@@ -32,6 +32,16 @@ class InvertibleDeformation(Deformation):
         """World positions (..., 3) at `times` (...,) of canonical positions (..., 3)."""
 
 
+def check_one_time(times: Tensor, time: float) -> None:
+    """Raise unless all times are that one; padded samples carry the time of a ray, too.
+
+    Raises:
+        ValueError: saying which there are.
+    """
+    if times.numel() and not bool((times - time).abs().amax() < 1e-6):
+        raise ValueError(f"times must all be {time}, got values from {times.min()} to {times.max()}")
+
+
 def check_positions_times(positions: Tensor, times: Tensor) -> None:
     """Raise unless positions are (..., 3) and times have their batch shape.
 

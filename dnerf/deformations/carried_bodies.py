@@ -10,6 +10,7 @@ from dnerf.deformations.base import Deformation, check_positions_times
 
 NOWHERE = 1e4
 """Coordinate of a track while its body is not there; nothing is shown half as far out or further."""
+LEAST_KNOTS = 4  # of a path that may bend
 ROUNDING = 1e-3  # of a radius, by which a line may seem to miss a ball
 
 
@@ -33,8 +34,8 @@ class CarriedBodies(nn.Module):
     def __init__(self, max_bodies: int = 8, num_knots: int = 101) -> None:
         super().__init__()
         check_positive("max_bodies", max_bodies)
-        if num_knots < 2:
-            raise ValueError(f"num_knots must be at least 2, got {num_knots}")
+        if num_knots < LEAST_KNOTS:
+            raise ValueError(f"num_knots must be at least {LEAST_KNOTS}, got {num_knots}")
         self.tracks = nn.Parameter(torch.zeros(max_bodies, num_knots, 3))
         self.register_buffer("homes", torch.zeros(max_bodies, 3))
         self.register_buffer("radii", torch.zeros(max_bodies))

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from dnerf.checks import as_box, check_positive
-from dnerf.deformations.base import Deformation, check_positions_times
+from dnerf.deformations.base import Deformation, check_one_time, check_positions_times
 from dnerf.kernels import GridLevels, MarchGrid, covered_places, few_nonzero, grid_encode
 
 LEAST_ROWS = 256  # fewer take matrix libraries as long
+MOST_AT_ONCE = 1 << 16  # vertices: bounds the memory of networks
 VERTICES_PER_RAY = 4  # most to ask around all occupied cells, instead of finding out which of them rays want
 
 Additions = Callable[[Tensor, Tensor], Tensor]
@@ -114,9 +115,7 @@ class FrozenDeformation(Deformation):
         check_positions_times(positions, times)
         if not positions.numel():
             return positions
-        # Padded samples carry the time of a ray too, so all are one.
-        if not bool((times - self.time).abs().amax() < 1e-6):
-            raise ValueError(f"times must all be {self.time}, got values from {times.min()} to {times.max()}")
+        check_one_time(times, self.time)
         self.move_to(positions.device)
         points = positions.reshape(-1, 3)
         unit = (points - self.low.to(points.dtype)) / self.sides.to(points.dtype)
@@ -202,6 +201,13 @@ class FrozenDeformation(Deformation):
         """
         if not len(places):
             return False
+        for part in places.split(MOST_AT_ONCE):
+            self.displacements[part] = self._asked(part)
+        self.is_known.view(-1)[places] = True
+        return True
+
+    def _asked(self, places: Tensor) -> Tensor:
+        """Rows of the table for vertices (K,), K > 0."""
         padded = torch.cat([places, places[-1:].expand(self._padded(len(places)) - len(places))])
         numbers = reversed(torch.unravel_index(padded, self.is_known.shape))
         vertices = torch.stack([faces[number] for faces, number in zip(self.faces, numbers, strict=True)], dim=-1)
@@ -210,6 +216,4 @@ class FrozenDeformation(Deformation):
         rows = torch.nn.functional.pad((canonical - vertices).float(), (0, 1))
         if self.additions is not None:
             rows = torch.cat([rows, self.additions(canonical, times).float()], dim=-1)
-        self.displacements[places] = rows[: len(places)]
-        self.is_known.view(-1)[places] = True
-        return True
+        return rows[: len(places)]

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from dnerf.checks import as_box, check_positive, check_shape
 from dnerf.compositing import FieldOutput
-from dnerf.deformations.base import check_positions_times
+from dnerf.deformations.base import check_one_time, check_positions_times
 from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField
@@ -146,7 +146,8 @@ class GridField(RadianceField):
 
     def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
         """The head's outputs; without times, those without `space_time`."""
-        return self.head(*self._inputs(positions, times))
+        features, scale = self._inputs(positions, times)
+        return self.head(features, scale, num_lacking=self.head.in_features - features.shape[-1])
 
     def _activated(self, raw: Tensor) -> Tensor:
         return activate_density(raw, self.density_activation, self.density_shift)
@@ -198,7 +199,8 @@ class GridField(RadianceField):
         assert self.space_time is not None
         features, scale = self._inputs(positions, None)
         with_it = self.head(*_joined(features, scale, self.space_time(positions, times)))
-        return self._at(with_it, times) - self._at(self.head(features, scale), times)
+        without = self.head(features, scale, num_lacking=self.space_time.out_features)
+        return self._at(with_it, times) - self._at(without, times)
 
     def _shown(self, series: Tensor, times: Tensor) -> FieldOutput:
         return self._activated_values(self._at(series, times))
@@ -230,6 +232,9 @@ class GridFieldAtTime(RadianceField):
     Args:
         field: what is asked, with contents that change with time; `space_time` is seen.
         time: in [0, 1]; the only one at which it may be asked.
+
+    Raises:
+        ValueError: for a field without contents; when asked, for other times.
     """
 
     def __init__(self, field: GridField, time: float) -> None:
@@ -239,6 +244,7 @@ class GridFieldAtTime(RadianceField):
             raise ValueError("field must have contents, got one whose head sees times or directions")
         waves = field._waves(field.low.new_tensor(time)).to(last.weight.dtype)
         self.field = field
+        self.time = time
         self.register_buffer("weight", torch.einsum("ckh,k->ch", last.weight.detach().unflatten(0, (4, -1)), waves))
         self.register_buffer("bias", last.bias.detach().unflatten(0, (4, -1)) @ waves)
         self.weight: Tensor
@@ -252,7 +258,10 @@ class GridFieldAtTime(RadianceField):
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
-        seen = self.field.head.before_output(*self.field._inputs(positions, times))
+        check_one_time(times, self.time)
+        features, scale = self.field._inputs(positions, times)
+        lacking = self.field.head.in_features - features.shape[-1]
+        seen = self.field.head.before_output(features, scale, num_lacking=lacking)
         return self.field._activated_values(nn.functional.linear(seen, self.weight, self.bias))
 
 

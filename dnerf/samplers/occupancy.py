@@ -10,6 +10,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_positive
 from dnerf.compositing import FieldOutput, render_weights
 from dnerf.fields.base import RadianceField, ask
+from dnerf.fixed_size import placed
 from dnerf.kernels import MarchGrid, footprints, march, march_to_size
 from dnerf.rays import Rays, Samples, parts_of
 from dnerf.samplers.occupancy_grid import OccupancyGrid
@@ -109,8 +110,9 @@ class OccupancySampler(OccupancyGrid):
             check_positive(name, value)
         if coarse_until > 1:
             raise ValueError(f"coarse_until must be in (0, 1], got {coarse_until}")
-        if not 0 <= split_weight < 1:
-            raise ValueError(f"split_weight must be in [0, 1), got {split_weight}")
+        for name, value in (("split_weight", split_weight), ("min_weight", min_weight)):
+            if not 0 <= value < 1:
+                raise ValueError(f"{name} must be in [0, 1), got {value}")
         if not 0 <= narrow_from <= 1:
             raise ValueError(f"narrow_from must be in [0, 1], got {narrow_from}")
         self.step_size = step_size
@@ -218,18 +220,19 @@ class OccupancySampler(OccupancyGrid):
             step=self.length if self.training else self.length.new_full((), self.step_size),
             size=marched,
         )
+        is_filled = intervals.ends > intervals.starts
         samples = Samples(
             intervals.starts, intervals.ends, len(rays), ray_indices=intervals.ray_indices,
-            ray_offsets=intervals.offsets,
+            ray_offsets=intervals.offsets, is_placed=placed(intervals.ray_indices, is_filled, len(rays), num_marched),
         )  # fmt: skip
         positions, _, times = samples.locate(rays)
         density = field.density(positions, times)
         if self.training:
-            self.observe(positions, times, torch.where(samples.lengths > 0, density, 0))
+            self.observe(positions, times, torch.where(is_filled, density, 0))
         weights = render_weights(density * samples.lengths, samples)
         splits = self.training_splits if self.training else self.render_splits
         is_seen = ~(weights <= min_weight) if min_weight else torch.ones_like(weights, dtype=torch.bool)
-        counts = self._counts(weights, splits) * (is_seen & (samples.lengths > 0))  # NaN is
+        counts = self._counts(weights, splits) * (is_seen & is_filled)  # NaN is
         samples, num_wanted = samples.fitted(counts, kept)
         return samples, torch.stack([num_marched, num_wanted])
 
@@ -303,6 +306,6 @@ class OccupancySampler(OccupancyGrid):
             first_round=FIRST_ROUND, most_at_once=MOST_AT_ONCE, pad_to=self.pad_to, observe=self.observe,
         )  # fmt: skip
         weights = weights[number]
-        is_visible = weights > self.min_weight
+        is_visible = ~(weights <= self.min_weight)  # NaN is
         kept = samples.kept(is_visible)
         return self._split(kept, weights[is_visible], self.training_splits)

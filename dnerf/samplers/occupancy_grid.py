@@ -123,14 +123,15 @@ class OccupancyGrid(Sampler):
             return None
         device = self.maxima.device
         generator = torch.Generator(device).manual_seed(step)
-        return torch.rand(self.num_probes, 5, generator=generator, device=device)
+        # float32 has 2^24 numbers there, and there may be more cells.
+        return torch.rand(self.num_probes, 5, generator=generator, device=device, dtype=torch.float64)
 
     @torch.no_grad()
     def learn(self, field: RadianceField, probes: Tensor) -> None:
         """Probe cells of the field, and decide anew which are occupied."""
         cells = (probes[:, 0] * self.maxima.numel()).long()
         self.maxima.mul_(self.decay).clamp_(min=NEGLIGIBLE * 1e-3)
-        self._probe(field, cells, probes[:, 1:])
+        self._probe(field, cells, probes[:, 1:].to(self.box.dtype))
         self.decide()
 
     @torch.no_grad()

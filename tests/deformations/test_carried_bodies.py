@@ -139,7 +139,7 @@ def test_what_cannot_be_carried() -> None:
     bodies.add(track, home, 0.3)
     with pytest.raises(ValueError, match="room for max_bodies = 1"):
         bodies.add(track, home, 0.3)
-    with pytest.raises(ValueError, match="num_knots must be at least 2, got 1"):
+    with pytest.raises(ValueError, match="num_knots must be at least 4, got 1"):
         CarriedBodies(1, 1)
     with pytest.raises(ValueError, match="max_bodies"):
         CarriedBodies(0)

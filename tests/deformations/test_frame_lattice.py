@@ -108,6 +108,24 @@ def test_what_rays_will_want_is_filled_at_once_unless_it_is_too_much() -> None:
     assert bend.num_points == asked
 
 
+def test_vertices_are_asked_in_parts_where_there_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Most(Bend):
+        most = 0
+
+        def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+            self.most = max(self.most, len(positions))
+            return super().forward(positions, times)
+
+    x, times, bend = points(2000, 5, torch.float32), torch.full((2000,), 0.4), Most()
+    whole = FrameLattice(BOX, 16).at_time(Bend(), 0.4)(x, times)
+    monkeypatch.setattr("dnerf.deformations.frame_lattice.MOST_AT_ONCE", 300)
+    frozen = FrameLattice(BOX, 16).at_time(bend, 0.4)
+    frozen.pad_to = 100
+    assert torch.equal(frozen(x, times), whole)
+    assert 0 < bend.most <= 300
+    assert bend.num_points > 2000
+
+
 def test_outside_its_box_the_deformation_itself_is_asked() -> None:
     x = points(50, 3, torch.float32) * 3
     times = torch.full((50,), 0.3)

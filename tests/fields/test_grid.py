@@ -145,6 +145,8 @@ def test_series_are_summed_up_for_pictures_where_there_are_any() -> None:
     assert frozen.weight.shape == (4, 16)  # of the head's sixteen to density and colour, not to 4 x 3 terms
     with pytest.raises(ValueError, match="must have contents"):
         GridFieldAtTime(small(view_degree=1), 0.3)
+    with pytest.raises(ValueError, match=r"times must all be 0\.3, got values from 0\.5 to 0\.5"):
+        frozen.density(torch.zeros(4, 3), torch.full((4,), 0.5))
 
 
 def test_levels_that_are_not_in_yet_are_not_seen() -> None:

@@ -209,6 +209,15 @@ def test_what_is_known_of_parts_is_not_asked_again(splits: int, split_weight: fl
     assert len(Fog.asked) == 2
 
 
+def test_probes_reach_every_cell_of_a_large_grid() -> None:
+    """float32 has no odd numbers beyond 2^24."""
+    sampler = small()
+    probes = sampler.probes(sampler.update_every)
+    assert probes is not None
+    cells = (probes[:, 0] * 2**25).long()  # as many as those of 16 slabs of 128 x 128 x 128
+    assert 0.45 < (cells % 2).float().mean() < 0.55
+
+
 def test_cells_can_be_set() -> None:
     sampler = small(render_margin=0)
     sampler.occupy(torch.tensor(False))
@@ -300,6 +309,8 @@ def test_grid_is_saved_with_the_model() -> None:
         ({"splits": 0}, "^splits must be > 0"),
         ({"split_weight": 1.0}, r"split_weight must be in \[0, 1\), got 1.0"),
         ({"split_weight": math.nan}, r"split_weight must be in \[0, 1\), got nan"),
+        ({"min_weight": 1.0}, r"min_weight must be in \[0, 1\), got 1.0"),
+        ({"min_weight": -3.0}, r"min_weight must be in \[0, 1\), got -3.0"),
         ({"render_splits": 0}, "render_splits must be > 0"),
         ({"narrow_from": 1.5}, r"narrow_from must be in \[0, 1\]"),
         ({"filter_joins": 0}, "filter_joins must be > 0"),
