@@ -107,9 +107,10 @@ def test_it_shows_what_the_chain_shows(time_terms: int, splits: int) -> None:
 @pytest.mark.parametrize("ahead", [0, 100])
 def test_rays_that_meet_carried_bodies_are_left_to_the_field(ahead: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dnerf.deformations.frame_lattice.VERTICES_PER_RAY", ahead)
-    bodies = CarriedBodies(2, 3)
-    bodies.add(torch.tensor([[-0.3, 0.0, 0.1], [0.2, 0.1, 0.0], [0.3, 0.0, 0.1]]), torch.tensor([0.8, 0.8, 0.8]), 0.12)
-    bodies.add(torch.full((3, 3), NOWHERE), torch.tensor([0.1, -0.2, -0.3]), 0.1)  # it is not there
+    bodies = CarriedBodies(2, 5)
+    track = torch.tensor([[-0.3, 0.0, 0.1], [-0.05, 0.05, 0.05], [0.2, 0.1, 0.0], [0.25, 0.05, 0.05], [0.3, 0.0, 0.1]])
+    bodies.add(track, torch.tensor([0.8, 0.8, 0.8]), 0.12)
+    bodies.add(torch.full((5, 3), NOWHERE), torch.tensor([0.1, -0.2, -0.3]), 0.1)  # it is not there
     with use_backend("reference"):
         expected = picture(model(stop=1e-5, bodies=bodies))
         without = picture(model(stop=1e-5))
