@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dnerf.backgrounds import RandomBackground
-from dnerf.body_search import BodySearch
+from dnerf.body_search import BodySearch, one_of_each_moment
 from dnerf.data import SyntheticData
 from dnerf.data.frames import Frames
 from dnerf.data.synthetic import random_views, render_frames
@@ -111,6 +111,11 @@ def test_the_fast_ball_is_carried_along_its_path_and_the_slow_one_is_not(frames:
         assert float(misses.median()) < 0.03
         is_known[is_there] |= misses < 0.08
     assert float(is_known.float().mean()) > 0.8
+
+
+def test_of_cameras_that_see_one_moment_another_one_is_taken_each_time() -> None:
+    assert one_of_each_moment(torch.tensor([0.5, 0.0, 1.0, 0.5, 0.0, 1.0, 0.25])) == [1, 6, 0, 5]
+    assert one_of_each_moment(torch.tensor([1.0, 0.0, 0.5])) == [1, 2, 0]
 
 
 def test_several_cameras_may_see_one_moment() -> None:

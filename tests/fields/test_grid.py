@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from dnerf.fields import GridField
+from dnerf.fields import GridField, SpaceTimeVolumes
 from dnerf.fields.grid import GridFieldAtTime
 
 BOX = [[-1.0, 0.0, 2.0], [1.0, 1.0, 6.0]]
@@ -147,6 +147,18 @@ def test_series_are_summed_up_for_pictures_where_there_are_any() -> None:
         GridFieldAtTime(small(view_degree=1), 0.3)
     with pytest.raises(ValueError, match=r"times must all be 0\.3, got values from 0\.5 to 0\.5"):
         frozen.density(torch.zeros(4, 3), torch.full((4,), 0.5))
+
+
+def test_what_is_no_level_is_seen_whatever_the_window() -> None:
+    volumes = SpaceTimeVolumes(BOX, (4,), (3,), num_features=2)
+    positions = torch.rand(30, 3) + torch.tensor([0.0, 0.0, 3.0])
+    for options in ({"time_frequencies": 2}, {"space_time": volumes}, {"time_frequencies": 2, "space_time": volumes}):
+        field = small(window_end=1.0, **options)
+        for table in volumes.tables:
+            torch.nn.init.normal_(table)
+        field.set_progress(0.0)
+        first, last = (field.density(positions, torch.full((30,), time)) for time in (0.1, 0.8))
+        assert float((first - last).abs().max()) > 1e-3
 
 
 def test_levels_that_are_not_in_yet_are_not_seen() -> None:
