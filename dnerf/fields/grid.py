@@ -146,8 +146,13 @@ class GridField(RadianceField):
 
     def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
         """The head's outputs; without times, those without `space_time`."""
+        assert self.head.output is not None
+        return self.head.output(self._before_output(positions, times))
+
+    def _before_output(self, positions: Tensor, times: Tensor | None) -> Tensor:
+        """What the head's last layer sees."""
         features, scale = self._inputs(positions, times)
-        return self.head(features, scale, num_lacking=self.head.in_features - features.shape[-1])
+        return self.head.before_output(features, scale, num_lacking=self.head.in_features - features.shape[-1])
 
     def _activated(self, raw: Tensor) -> Tensor:
         return activate_density(raw, self.density_activation, self.density_shift)
@@ -259,9 +264,7 @@ class GridFieldAtTime(RadianceField):
         """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
         check_one_time(times, self.time)
-        features, scale = self.field._inputs(positions, times)
-        lacking = self.field.head.in_features - features.shape[-1]
-        seen = self.field.head.before_output(features, scale, num_lacking=lacking)
+        seen = self.field._before_output(positions, times)
         return self.field._activated_values(nn.functional.linear(seen, self.weight, self.bias))
 
 
