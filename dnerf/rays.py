@@ -49,6 +49,12 @@ class Rays:
     def __getitem__(self, index: slice | Tensor) -> "Rays":
         return self._map(lambda x: x[index])
 
+    def places(self, ray_indices: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions (N, 3), directions (N, 3) and times (N,) at distances (N,) along rays with numbers (N,) int64."""
+        # One gather of seven columns is several times quicker than three of one to three.
+        columns = torch.cat([self.origins, self.directions, self.times[:, None]], dim=-1)
+        return _placed(columns.index_select(0, ray_indices), distances)
+
     def to(self, *args: Any, **kwargs: Any) -> "Rays":
         """Move or cast every tensor, with the arguments of `Tensor.to`."""
         return self._map(lambda x: x.to(*args, **kwargs))
@@ -140,10 +146,10 @@ class Samples:
 
     def locate(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (..., 3), directions (..., 3) and times (...,) of the samples, (R, S) or (N,)."""
-        # One gather of seven columns is several times quicker than three of one to three.
-        rows = self.per_sample(torch.cat([rays.origins, rays.directions, rays.times[:, None]], dim=-1))
-        directions = rows[..., 3:6]
-        return torch.addcmul(rows[..., :3], self.distances[..., None], directions), directions, rows[..., 6]
+        if self.ray_indices is not None:
+            return rays.places(self.ray_indices, self.distances)
+        columns = torch.cat([rays.origins, rays.directions, rays.times[:, None]], dim=-1)
+        return _placed(self.per_sample(columns), self.distances)
 
     def padded(self, multiple: int) -> "Samples":
         """Packed samples with intervals of length zero after the last one, up to a multiple of so many.
@@ -274,3 +280,9 @@ def parts_of(counts: Tensor) -> tuple[Tensor, Tensor]:
     ends = counts.cumsum(0)
     whole = torch.repeat_interleave(counts)
     return whole, torch.arange(len(whole), device=whole.device) - (ends - counts)[whole]
+
+
+def _placed(rows: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions, directions and times of rows (..., 7): a ray's origin, direction and time."""
+    directions = rows[..., 3:6]
+    return torch.addcmul(rows[..., :3], distances[..., None], directions), directions, rows[..., 6]

@@ -13,7 +13,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.compositing import Rendering, composite, safe_divide
 from dnerf.deformations.frame_lattice import FrozenDeformation
-from dnerf.fields.base import RadianceField, ask
+from dnerf.fields.base import RadianceField, ask_along
 from dnerf.frame_graphs import FrameGraphs
 from dnerf.kernels import few_nonzero
 from dnerf.quadrature import check_rule
@@ -144,7 +144,8 @@ class Renderer(nn.Module):
                 if refines:
                     part, output = self.sampler.refined(part, chosen, field, transmittance, self.stop_transmittance)
                 else:
-                    output = ask(field, *part.locate(chosen))
+                    assert part.ray_indices is not None
+                    output = ask_along(field, chosen, part.ray_indices, part.distances)
             seen = composite(part, output)
             columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
             sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))

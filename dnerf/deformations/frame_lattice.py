@@ -8,7 +8,8 @@ from torch import Tensor
 
 from dnerf.checks import as_box, check_positive
 from dnerf.deformations.base import Deformation, check_one_time, check_positions_times
-from dnerf.kernels import GridLevels, MarchGrid, covered_places, few_nonzero, grid_encode
+from dnerf.kernels import GridLevels, MarchGrid, covered_places, few_nonzero, grid_encode, lattice_places
+from dnerf.rays import Rays
 
 LEAST_ROWS = 256  # fewer take matrix libraries as long
 MOST_AT_ONCE = 1 << 16  # vertices: bounds the memory of networks
@@ -130,6 +131,25 @@ class FrozenDeformation(Deformation):
             rest = ~((unit >= 0) & (unit <= 1)).all(-1)
             moved[rest] = self.deformation(points[rest], times.reshape(-1)[rest]).to(moved.dtype)
         return moved.reshape(positions.shape)
+
+    @torch.no_grad()
+    def along(self, rays: Rays, ray_indices: Tensor, distances: Tensor) -> Tensor:
+        """Canonical positions (N, 3) at distances (N,), in world units, along the rays with numbers (N,) int64.
+
+        Raises:
+            ValueError: for rays of other times than the lattice's.
+        """
+        check_one_time(rays.times, self.time)
+        self.move_to(distances.device)
+        canonical = lattice_places(
+            rays.origins, rays.directions, ray_indices, distances, self.displacements, self.is_known.shape, self.low,
+            self.sides,
+        )  # fmt: skip
+        rest = few_nonzero(canonical[:, 0].isnan())
+        if len(rest):
+            positions, _, times = rays.places(ray_indices[rest], distances[rest])
+            canonical[rest] = self(positions, times).to(canonical.dtype)
+        return canonical
 
     def move_to(self, device: torch.device) -> None:
         """Have what is kept on a device."""

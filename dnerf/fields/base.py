@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.compositing import FieldOutput
+from dnerf.rays import Rays
 
-MOST_AT_ONCE = 1 << 17  # places that `ask` asks in one go: bounds the memory, in haze
+MOST_AT_ONCE = 1 << 17  # places that `ask_along` asks in one go: bounds the memory, in haze
 
 
 class RadianceField(nn.Module, ABC):
@@ -29,6 +30,10 @@ class RadianceField(nn.Module, ABC):
         Returns:
             `FieldOutput` with density (...,) and rgb (..., 3) in [0, 1].
         """
+
+    def along(self, rays: Rays, ray_indices: Tensor, distances: Tensor) -> FieldOutput:
+        """What `forward` says at distances (N,) along the rays with numbers (N,) int64, perhaps without extras."""
+        return self(*rays.places(ray_indices, distances))
 
     def _without_contents(self) -> ValueError:
         return ValueError(f"{type(self).__name__} has no contents that say all about a place (num_contents is 0)")
@@ -105,19 +110,25 @@ class RadianceField(nn.Module, ABC):
         return self
 
 
-def ask(field: RadianceField, positions: Tensor, directions: Tensor, times: Tensor, *, pad_to: int = 1) -> FieldOutput:
-    """Density (N,) and rgb (N, 3) of a field, asked at most `MOST_AT_ONCE` places at a time, without extras.
+def ask_along(
+    field: RadianceField, rays: Rays, ray_indices: Tensor, distances: Tensor, *, pad_to: int = 1
+) -> FieldOutput:
+    """Density (N,) and rgb (N, 3) of a field along rays, at most `MOST_AT_ONCE` places at a time, without extras.
 
     Args:
         field: what is asked.
-        positions, directions, times: (N, 3), (N, 3), (N,), see `RadianceField.forward`.
+        rays: R rays.
+        ray_indices: (N,) int64, the ray of each place.
+        distances: (N,) along it, in world units.
         pad_to: a multiple of so many places is asked: matrix libraries compile code for every new number of rows.
     """
-    count = len(times)
+    count = len(distances)
     padding = -count % pad_to if count else 0
-    padded = [
-        torch.cat([x, x[-1:].expand(padding, *x.shape[1:])]) if padding else x for x in (positions, directions, times)
+    if padding:
+        ray_indices, distances = (torch.cat([x, x[-1:].expand(padding)]) for x in (ray_indices, distances))
+    parts = [
+        field.along(rays, *part)
+        for part in zip(ray_indices.split(MOST_AT_ONCE), distances.split(MOST_AT_ONCE), strict=True)
     ]
-    parts = [field(*part) for part in zip(*(x.split(MOST_AT_ONCE) for x in padded), strict=True)]
     density, rgb = (torch.cat(x) if len(x) > 1 else x[0] for x in zip(*((p.density, p.rgb) for p in parts)))
     return FieldOutput(density[:count], rgb[:count])

@@ -13,11 +13,13 @@ from dnerf.deformations import (
     Deformation,
     FlowDeformation,
     FrameLattice,
+    FrozenDeformation,
     IdentityDeformation,
     deform_along_rays,
 )
 from dnerf.fields.baked import Baking
 from dnerf.fields.base import RadianceField
+from dnerf.rays import Rays
 
 
 class DeformedField(RadianceField):
@@ -121,6 +123,15 @@ class DeformedField(RadianceField):
         }
         density = self._shown(output.density, carried)
         return replace(output, density=density, extras={**output.extras, **extras})
+
+    def along(self, rays: Rays, ray_indices: Tensor, distances: Tensor) -> FieldOutput:
+        """What `forward` says at distances (N,) along the rays with numbers (N,), without extras where it can do so."""
+        deformation = self.deformation
+        if not isinstance(deformation, FrozenDeformation) or (self.bodies is not None and self.bodies.num_bodies):
+            return super().along(rays, ray_indices, distances)
+        positions = deformation.along(rays, ray_indices, distances)
+        times = distances.new_full(distances.shape, deformation.time)
+        return self.canonical(positions, rays.directions.index_select(0, ray_indices), times)
 
     def _shown(self, density: Tensor, carried: Tensor) -> Tensor:
         """Densities (...,) at carried positions (..., 3): none at the home of a body that is not there."""

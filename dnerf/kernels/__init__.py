@@ -6,11 +6,13 @@ from .covered_places import covered_places
 from .few_nonzero import few_nonzero
 from .footprints import Footprints, footprints
 from .grid_encode import GridLevels, grid_encode
+from .lattice_places import lattice_places
 from .march import MarchedSamples, MarchGrid, march
 from .march_to_size import march_to_size
 from .packed_sum import packed_sum
 from .packed_weights import packed_weights
-from .relu_layers import relu_layers
+from .relu_layers import is_bfloat16_wanted, relu_layers
+from .seen_parts import SeenParts, seen_parts
 from .skip_distances import skip_distances
 from .thin_out import thin_out
 from .trace import FrameTables, trace
@@ -22,17 +24,21 @@ __all__ = [
     "GridLevels",
     "MarchGrid",
     "MarchedSamples",
+    "SeenParts",
     "brick_lookup",
     "covered_places",
     "few_nonzero",
     "footprints",
     "get_backend",
     "grid_encode",
+    "is_bfloat16_wanted",
+    "lattice_places",
     "march",
     "march_to_size",
     "packed_sum",
     "packed_weights",
     "relu_layers",
+    "seen_parts",
     "set_backend",
     "skip_distances",
     "thin_out",

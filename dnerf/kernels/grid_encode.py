@@ -82,7 +82,7 @@ class GridLevels:
         ]
 
 
-def grid_encode(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:
+def grid_encode(positions: Tensor, table: Tensor, levels: GridLevels, *, rounded: bool = False) -> Tensor:
     """Interpolate the features of every grid level at the given positions.
 
     Per level, `sum_c w_c table[row(c)]` over the 8 vertices of the position's cell, with trilinear weights w.
@@ -93,9 +93,11 @@ def grid_encode(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:
         positions: (N, 3), in [0, 1], differentiable.
         table: (T, F), differentiable; T = `levels.num_rows`.
         levels: the grid's resolutions and table layout.
+        rounded: to bfloat16, for networks that would round them anyway; where gradients are recorded, and in float64,
+            this is ignored.
 
     Returns:
-        (N, L F) features, level by level, in the wider dtype of the arguments and at least float32.
+        (N, L F) features, level by level, in the wider dtype of the arguments and at least float32 if not rounded.
 
     Raises:
         ValueError: a shape that does not fit.
@@ -110,9 +112,15 @@ def grid_encode(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:
     if positions.dtype != table.dtype or positions.dtype != torch.float32:
         dtype = torch.promote_types(torch.promote_types(positions.dtype, table.dtype), torch.float32)
         positions, table = positions.to(dtype), table.to(dtype)
-    if choose(positions) == "reference":
-        return grid_encode_reference(positions, table, levels)
-    return torch.ops.dnerf.grid_encode(positions, table, levels.cells, levels.max_rows)
+    rounded = rounded and positions.dtype == torch.float32 and not torch.is_grad_enabled()
+    backend = choose(positions)
+    if rounded and backend == "numba":
+        return torch.ops.dnerf.grid_encode_rounded(positions, table, levels.cells, levels.max_rows)
+    if backend == "reference":
+        features = grid_encode_reference(positions, table, levels)
+    else:
+        features = torch.ops.dnerf.grid_encode(positions, table, levels.cells, levels.max_rows)
+    return features.bfloat16() if rounded else features
 
 
 def grid_encode_reference(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:
@@ -140,6 +148,11 @@ def _grid_encode(positions: Tensor, table: Tensor, cells: list[int], max_rows: i
     return run_compiled("grid_encode", "forward", positions, table, cells, max_rows)
 
 
+@torch.library.custom_op("dnerf::grid_encode_rounded", mutates_args=())
+def _grid_encode_rounded(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
+    return run_compiled("grid_encode", "forward_rounded", positions, table, cells, max_rows)
+
+
 @torch.library.custom_op("dnerf::grid_encode_grad_table", mutates_args=())
 def _grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "grad_table", grad, positions, table, cells, max_rows)
@@ -153,6 +166,11 @@ def _grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[
 @_grid_encode.register_fake
 def _(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return table.new_empty((positions.shape[0], len(cells) // 3 * table.shape[1]))
+
+
+@_grid_encode_rounded.register_fake
+def _(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
+    return table.new_empty((positions.shape[0], len(cells) // 3 * table.shape[1]), dtype=torch.bfloat16)
 
 
 @_grad_table.register_fake

@@ -29,7 +29,7 @@ def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tens
     Returns:
         (..., out_features of the last layer), differentiable to any order.
     """
-    if not (_is_bfloat16_wanted(inputs) and choose(inputs) != "reference"):
+    if not (is_bfloat16_wanted(inputs) and choose(inputs) != "reference"):
         return relu_layers_reference(inputs, weights, biases)
     weights, biases = [p.bfloat16() for p in weights], [p.bfloat16() for p in biases]
     outputs = inputs.reshape(-1, inputs.shape[-1]).bfloat16()
@@ -48,7 +48,8 @@ def relu_layers_reference(inputs: Tensor, weights: Sequence[Tensor], biases: Seq
     return inputs
 
 
-def _is_bfloat16_wanted(inputs: Tensor) -> bool:
+def is_bfloat16_wanted(inputs: Tensor) -> bool:
+    """Whether layers round such inputs to bfloat16: under autocast, where there are instructions for it."""
     if inputs.is_cuda:
         return (
             inputs.dtype != torch.float64

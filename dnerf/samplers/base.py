@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from dnerf.cameras import Camera
 from dnerf.compositing import FieldOutput
-from dnerf.fields.base import RadianceField, ask
+from dnerf.fields.base import RadianceField, ask_along
 from dnerf.kernels import MarchGrid
 from dnerf.rays import Rays, Samples
 
@@ -57,7 +57,8 @@ class Sampler(nn.Module, ABC):
             Packed samples of the same rays, in the same intervals, and what the field says there, without extras;
             those themselves unless overridden.
         """
-        return samples, ask(field, *samples.locate(rays))
+        assert samples.ray_indices is not None
+        return samples, ask_along(field, rays, samples.ray_indices, samples.distances)
 
     def seen_rays(self, camera: Camera, time: float) -> tuple[Tensor, Rays] | None:
         """Pixels of a view in whose rays this sampler may place samples in evaluation mode; all unless overridden.

@@ -9,10 +9,10 @@ from torch import Tensor
 from dnerf.cameras import Camera
 from dnerf.checks import check_positive
 from dnerf.compositing import FieldOutput, render_weights
-from dnerf.fields.base import RadianceField, ask
+from dnerf.fields.base import RadianceField, ask_along
 from dnerf.fixed_size import placed
-from dnerf.kernels import MarchGrid, footprints, march, march_to_size
-from dnerf.rays import Rays, Samples, parts_of
+from dnerf.kernels import MarchGrid, footprints, march, march_to_size, seen_parts
+from dnerf.rays import Rays, Samples
 from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.samplers.visibility import joined, visible_weights
 
@@ -165,21 +165,23 @@ class OccupancySampler(OccupancyGrid):
 
         What is known is not asked again: whole intervals, and parts in whose middle their interval's is.
         """
-        known = ask(field, *samples.locate(rays))
+        assert samples.ray_indices is not None
+        known = ask_along(field, rays, samples.ray_indices, samples.distances)
         if self.render_splits == 1:
             return samples, known
-        weights = render_weights(known.density * samples.lengths, samples) * samples.per_sample(transmittance)
-        seen = (~(weights <= min_weight)).nonzero()[:, 0]  # NaN is
-        counts = self._counts(weights.index_select(0, seen), self.render_splits)
-        parts = samples.chosen(seen).split(counts)
-        whole, number = parts_of(counts)
-        density, rgb = (x.index_select(0, seen[whole]) for x in (known.density, known.rgb))
-        new = (2 * number + 1 != counts[whole]).nonzero()[:, 0]
-        if len(new):
-            positions, directions, times = (x.index_select(0, new) for x in parts.locate(rays))
-            asked = ask(field, positions, directions, times, pad_to=self.pad_to)
-            density[new], rgb[new] = asked.density, asked.rgb
-        return parts, FieldOutput(density, rgb)
+        parts = seen_parts(
+            samples.starts, samples.ends, samples.offsets, known.density, transmittance,
+            splits=self.render_splits, split_weight=self.split_weight, min_weight=min_weight,
+        )  # fmt: skip
+        placed_parts = Samples(
+            parts.starts, parts.ends, len(rays), ray_indices=parts.ray_indices, ray_offsets=parts.offsets
+        )
+        density, rgb = (x.index_select(0, parts.whole) for x in (known.density, known.rgb))
+        if len(parts.new):
+            numbers, distances = (x.index_select(0, parts.new) for x in (parts.ray_indices, placed_parts.distances))
+            asked = ask_along(field, rays, numbers, distances, pad_to=self.pad_to)
+            density[parts.new], rgb[parts.new] = asked.density, asked.rgb
+        return placed_parts, FieldOutput(density, rgb)
 
     def fix_sizes(self, marched: int | None, kept: int | None = None) -> None:
         """In training, place samples by `to_size` from now on, in so many places; None for no more."""

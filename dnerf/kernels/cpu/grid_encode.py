@@ -21,19 +21,29 @@ SAMPLES_AT_ONCE = 256  # dealt out to threads
 
 
 def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    num_features = table.shape[1]
-    out = table.new_empty((positions.shape[0], len(cells) // 3 * num_features))
+    out = table.new_empty((positions.shape[0], len(cells) // 3 * table.shape[1]))
+    _launch_forward(positions, table, cells, max_rows, out.numpy())
+    return out
+
+
+def forward_rounded(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
+    out = table.new_empty((positions.shape[0], len(cells) // 3 * table.shape[1]), dtype=torch.bfloat16)
+    bits = out.view(torch.int16).numpy().view(np.uint16)
+    _launch_forward(positions, table, cells, max_rows, bits)
+    return out
+
+
+def _launch_forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int, out: np.ndarray) -> None:
     launch(
         _forward,
         _array(positions),
         _array(table),
         _levels(tuple(cells), max_rows),
-        out.numpy(),
+        out,
         num_threads(),
         none_taken(),
-        (0,) * num_features,
+        (0,) * table.shape[1],
     )
-    return out
 
 
 def grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:

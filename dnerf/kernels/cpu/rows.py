@@ -42,7 +42,8 @@ def _splat(builder: Any, value: Any, width: int) -> Any:
 def blend_rows(typing: Any, table: Any, rows: Any, weights: Any, out: Any, start: Any, lanes: Any) -> tuple[Any, Any]:
     """out.flat[start : start + F] = sum_k weights[k] * table[rows[k]], for tuples of rows and weights.
 
-    A table in half precision is given as uint16; weights and `out` are then in single precision.
+    A table in half precision is given as uint16; weights and `out` are then in single precision. `out` in bfloat16 is
+    given as uint16, too; it gets numbers of single precision, rounded to the nearest, ties to even.
     """
     width = lanes.count
 
@@ -55,10 +56,26 @@ def blend_rows(typing: Any, table: Any, rows: Any, weights: Any, out: Any, start
             term = builder.fmul(_splat(builder, builder.extract_value(weights_, k), width), row, flags=FLAGS)
             total = term if total is None else builder.fadd(total, term, flags=FLAGS)
         pointer = _vector_pointer(context, builder, out, out_, start_, width)
+        total = _rounded(builder, total, width) if out.dtype == types.uint16 else total
         builder.store(total, pointer, align=out.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(table, rows, weights, out, start, lanes), generate
+
+
+def _rounded(builder: Any, values: Any, width: int) -> Any:
+    """The bits of a float32 vector in bfloat16, which is the upper half of each number's."""
+    word = ir.VectorType(ir.IntType(32), width)
+
+    def constant(number: int) -> Any:
+        return ir.Constant(word, [number] * width)
+
+    bits = builder.bitcast(values, word)
+    is_odd = builder.and_(builder.lshr(bits, constant(16)), constant(1))
+    rounded = builder.add(bits, builder.add(is_odd, constant(0x7FFF)))
+    is_nan = builder.fcmp_unordered("uno", values, values)
+    kept = builder.select(is_nan, constant(0x7FC00000), rounded)
+    return builder.trunc(builder.lshr(kept, constant(16)), ir.VectorType(ir.IntType(16), width))
 
 
 @intrinsic

@@ -1,0 +1,101 @@
+"""Which intervals of rays are seen, and the parts into which they are cut."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .backend import choose, run_compiled
+from .packed_weights import packed_weights
+
+
+class SeenParts(NamedTuple):
+    """M intervals, whole ones and parts, of R rays.
+
+    Args:
+        starts, ends: (M,) distances along the rays, in order.
+        ray_indices: (M,) int64.
+        offsets: (R + 1,) int64, where each ray's begin and end.
+        whole: (M,) int64, of which given interval each is, or is a part.
+        new: (P,) int64, those of them, in order, in whose middle that interval's middle is not.
+    """
+
+    starts: Tensor
+    ends: Tensor
+    ray_indices: Tensor
+    offsets: Tensor
+    whole: Tensor
+    new: Tensor
+
+
+@torch.no_grad()
+def seen_parts(
+    starts: Tensor,
+    ends: Tensor,
+    offsets: Tensor,
+    density: Tensor,
+    light: Tensor,
+    *,
+    splits: int,
+    split_weight: float,
+    min_weight: float,
+) -> SeenParts:
+    """Leave out intervals that are not seen, and cut those that are seen well into parts of equal lengths.
+
+    An interval's weight is `packed_weights` of its optical depth times the light that comes to its ray's first one.
+    Those up to `min_weight` are left out, those up to `split_weight` stay whole, those above and NaN are cut. Not
+    differentiable.
+
+    Args:
+        starts, ends: (N,) distances along R rays, ray by ray and in order.
+        offsets: (R + 1,) int64, where each ray's intervals begin and end.
+        density: (N,), in 1 / unit of the distances, >= 0.
+        light: (R,) transmittance before each ray's first interval.
+        splits: parts of an interval that is cut, >= 1.
+        split_weight: see above.
+        min_weight: likewise.
+
+    Raises:
+        ValueError: shapes that do not fit each other, splits below 1, or (by the compiled version) offsets that do not
+            run from 0 to N.
+    """
+    if splits < 1:
+        raise ValueError(f"splits must be at least 1, got {splits}")
+    if offsets.ndim != 1 or light.shape != (len(offsets) - 1,):
+        raise ValueError(f"offsets and light must have shapes (R + 1,) and (R,), got {offsets.shape} and {light.shape}")
+    for name, value in (("ends", ends), ("density", density)):
+        if value.shape != starts.shape or starts.ndim != 1:
+            raise ValueError(f"starts and {name} must have shape (N,), got {tuple(starts.shape)}, {tuple(value.shape)}")
+    arguments = (starts, ends, offsets, density, light, splits, split_weight, min_weight)
+    is_of_one_kind = all(x.dtype == starts.dtype for x in (ends, density, light))
+    if is_of_one_kind and choose(starts) == "numba":
+        return SeenParts(*run_compiled("seen_parts", "seen_parts", *arguments))
+    return seen_parts_reference(*arguments)
+
+
+def seen_parts_reference(
+    starts: Tensor,
+    ends: Tensor,
+    offsets: Tensor,
+    density: Tensor,
+    light: Tensor,
+    splits: int,
+    split_weight: float,
+    min_weight: float,
+) -> SeenParts:
+    """The definition of `seen_parts` in plain torch."""
+    rays = torch.repeat_interleave(offsets.diff())
+    weights = packed_weights(density * (ends - starts), offsets) * light[rays]
+    counts = torch.where(weights <= min_weight, 0, torch.where(weights <= split_weight, 1, splits))
+    whole = torch.repeat_interleave(counts)
+    before = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    number, parts = torch.arange(len(whole), device=whole.device) - before[whole], counts[whole]
+    first, last = starts[whole], ends[whole]
+    return SeenParts(
+        starts=torch.lerp(first, last, number / parts.to(first.dtype)),  # exact at both ends
+        ends=torch.lerp(first, last, (number + 1) / parts.to(first.dtype)),
+        ray_indices=rays[whole],
+        offsets=before[offsets],
+        whole=whole,
+        new=(2 * number + 1 != parts).nonzero()[:, 0],
+    )
