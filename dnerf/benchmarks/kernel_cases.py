@@ -21,11 +21,13 @@ from dnerf.kernels import (
     few_nonzero,
     footprints,
     grid_encode,
+    lattice_places,
     march,
     march_to_size,
     packed_sum,
     packed_weights,
     relu_layers,
+    seen_parts,
     skip_distances,
     thin_out,
     trace,
@@ -199,6 +201,18 @@ class Workload:
         covered = view()
         seen = 0 if covered is None else len(covered.pixels)
         times = self.rays.times[self.marched.ray_indices]
+        side, r, found = DISPLACEMENTS + 1, self.rays, self.marched
+        low, sides = self.box[0], self.box[1] - self.box[0]
+        middles = 0.5 * (found.starts + found.ends)
+        places = partial(
+            lattice_places, r.origins, r.directions, found.ray_indices, middles, torch.zeros(side**3, 4), (side,) * 3,
+            low, sides,
+        )  # fmt: skip
+        thin, light = torch.full_like(middles, 5.0), torch.ones_like(r.near)
+        parts = partial(
+            seen_parts, found.starts, found.ends, found.offsets, thin, light, splits=3, split_weight=0.02,
+            min_weight=4e-3,
+        )  # fmt: skip
         layers = sum(x.nbytes for x in self.layers) // 2
         activations = self.num_samples * (2 * WIDTHS[0] + 2 * WIDTHS[-1])
         return [
@@ -221,6 +235,8 @@ class Workload:
                 _backends(lambda: covered_places(lows, ends, (DISPLACEMENTS + 1,) * 3)),
                 lows.nbytes + ends.nbytes + around.nbytes,
             ),
+            Case("lattice_places", "forward", _backends(places), (2 + 1 + 3) * n),
+            Case("seen_parts", "forward", _backends(parts), 3 * n + 16 * self.num_samples),
             Case("footprints", "forward", _backends(view), occupied.nbytes + 16 * seen),
             Case("trace", "forward", _backends(self._tracer()), 10 * 4 * len(self.rays) + contents),
             *_both(

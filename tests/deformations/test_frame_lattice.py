@@ -1,5 +1,7 @@
 """The lattice that stands in for a deformation while one frame is rendered."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -159,6 +161,26 @@ def test_part_of_a_lattice_where_there_is_none_is_still_one(corners: tuple[float
     x = points(40, 2, torch.float32)
     times = torch.full((40,), 0.7)
     torch.testing.assert_close(part(x, times), Bend()(x, times), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_along_rays_it_is_what_it_is_at_their_positions(dtype: torch.dtype) -> None:
+    """Places outside the lattice and in cells that are not known yet among them."""
+    bend, lattice = Bend(), FrameLattice(BOX, 12)
+    rays = Camera(Intrinsics(9, 9, 8.0, 8.0), look_at((0.3, -3.0, 0.5), (0.0, 0.0, 0.0))).rays(0.7).to(dtype)
+    g = torch.Generator().manual_seed(0)
+    indices = torch.randint(len(rays), (900,), generator=g).sort().values
+    distances = 2 + 2.5 * torch.rand(900, generator=g, dtype=dtype)
+    positions, _, times = rays.places(indices, distances)
+    along, asked = lattice.at_time(bend, 0.7), lattice.at_time(Bend(), 0.7)
+    asked(positions, times)
+    for _ in range(2):  # vertices unknown, then known
+        torch.testing.assert_close(along.along(rays, indices, distances), asked(positions, times), rtol=0, atol=1e-6)
+        assert torch.equal(along.is_known, asked.is_known)
+    outside = (positions < torch.tensor(BOX[0])).any(-1) | (positions > torch.tensor(BOX[1])).any(-1)
+    assert 100 < int(outside.sum()) < 800
+    with pytest.raises(ValueError, match=r"times must all be 0.7"):
+        along.along(replace(rays, times=rays.times + 0.1), indices, distances)
 
 
 def test_shapes_emptiness_and_other_times() -> None:

@@ -6,9 +6,10 @@ from reference import FormulaField
 from torch import Tensor
 
 from dnerf.compositing import FieldOutput
-from dnerf.deformations import Deformation, FlowDeformation
+from dnerf.deformations import CarriedBodies, Deformation, FlowDeformation, FrameLattice
 from dnerf.deformations.velocities import NetworkVelocity
 from dnerf.fields import Baking, DeformedField, GridField, RadianceField
+from dnerf.rays import Rays
 
 
 class Drift(Deformation):
@@ -103,3 +104,31 @@ def test_motion_is_the_deformation_until_a_flow_is_fitted_instead() -> None:
     assert field.finished().motion is field.deformation
     # What pictures show does not change with it.
     assert torch.equal(field(positions, positions, times).extras["canonical_positions"], Drift()(positions, times))
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_along_rays_a_field_says_what_it_says_at_their_positions(frozen: bool) -> None:
+    canonical = FormulaField(lambda x: x.square().sum(-1), lambda x, d, t: torch.stack([x[..., 0], d[..., 1], t], -1))
+    lattice = FrameLattice([[-2.0] * 3, [2.0] * 3], 4)
+    field: RadianceField = DeformedField(Drift(), canonical, frame_lattice=lattice)
+    field = field.at_time(0.25) if frozen else field
+    directions = torch.nn.functional.normalize(torch.randn(6, 3), dim=-1)
+    rays = Rays(-2 * directions, directions, torch.full((6,), 0.25), torch.zeros(6), torch.full((6,), 4.0))
+    numbers, distances = torch.arange(60) // 10, torch.rand(60) * 4
+    along, at = field.along(rays, numbers, distances), field(*rays.places(numbers, distances))
+    torch.testing.assert_close(along.density, at.density, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(along.rgb, at.rgb, rtol=1e-5, atol=1e-6)
+
+
+def test_along_rays_carried_bodies_are_where_they_are() -> None:
+    bodies = CarriedBodies(2)
+    track = torch.zeros(bodies.num_knots, 3)
+    bodies.add(track, torch.tensor([1.5, 1.5, 1.5]), 0.4)
+    canonical = FormulaField(lambda x: x.square().sum(-1), lambda x, d, t: x)
+    field = DeformedField(
+        Drift(), canonical, frame_lattice=FrameLattice([[-2.0] * 3, [2.0] * 3], 4), bodies=bodies
+    ).at_time(0.25)
+    direction = torch.tensor([[1.0, 0.0, 0.0]])
+    rays = Rays(-2 * direction, direction, torch.full((1,), 0.25), torch.zeros(1), torch.full((1,), 4.0))
+    density = field.along(rays, torch.zeros(2, dtype=torch.int64), torch.tensor([1.0, 2.0])).density
+    torch.testing.assert_close(density, torch.tensor([1.25**2, 2 * 1.5**2 + 1.25**2]))  # at home, the second one

@@ -238,3 +238,28 @@ def test_second_derivative_of_a_compiled_kernel_is_refused():
         )
         with pytest.raises(RuntimeError, match="no autograd formula"):
             gradient.sum().backward()
+
+
+@pytest.mark.parametrize("backend", ["numba", "reference"])
+def test_rounded_features_are_those_that_are_rounded_after(backend):
+    positions, table = example(3000, num_features=8, dtype=torch.float32)
+    table[5], table[7] = torch.nan, 3e38
+    with kernels.use_backend(backend), torch.no_grad():
+        rounded = grid_encode(positions, table, LEVELS, rounded=True)
+        exact = grid_encode(positions, table, LEVELS)
+    assert rounded.dtype == torch.bfloat16
+    assert 0 < int(rounded.isnan().sum()) < rounded.numel() // 10
+    assert torch.equal(rounded.isnan(), exact.isnan())
+    assert torch.equal(rounded.nan_to_num(), exact.bfloat16().nan_to_num())
+
+
+def test_nothing_is_rounded_where_gradients_are_recorded_or_in_double_precision():
+    positions, table = example(20, dtype=torch.float32)
+    assert grid_encode(positions, table, LEVELS, rounded=True).dtype == torch.float32
+    with torch.no_grad():
+        assert grid_encode(positions.double(), table, LEVELS, rounded=True).dtype == torch.float64
+
+
+def test_opcheck_of_rounded_features():
+    positions, table = example(6, dtype=torch.float32)
+    torch.library.opcheck(torch.ops.dnerf.grid_encode_rounded.default, (positions, table, LEVELS.cells, 256))
