@@ -3,14 +3,15 @@
 import logging
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dnerf.checks import as_box, check_positive
-from dnerf.data.frames import Frames
+from dnerf.data.frames import Frames, composite_on
 from dnerf.deformations import CarriedBodies
 from dnerf.error_map import ErrorMap
-from dnerf.fast_bodies import fast_bodies, joined_bodies
+from dnerf.fast_bodies import FastBody, fast_bodies, joined_bodies
 from dnerf.fields import DeformedField, SpaceTimeVolumes
 from dnerf.renderer import Renderer
 from dnerf.samplers.occupancy_grid import OccupancyGrid
@@ -32,6 +33,7 @@ PLANT_STEPS = 200
 PLANT_DEPTH = 2.3  # logarithm of the density that is planted: about ten for each world unit
 PLANT_LEFT = 0.25  # mean squared difference from it that is near enough
 ROUNDS_AT_END = 8  # of as many points each
+PIXELS_AT_ONCE = 1 << 13
 POINTS = 20_000  # on a track, to which a sampler's attention is called
 
 
@@ -119,7 +121,10 @@ class BodySearch:
         search = PathSearch(self.box.tolist(), tolerance)
         paths = search([sightings[number] for number in chosen], times.tolist())
         spacing = float(times.diff().median()) if len(paths) else 0.0
-        found = joined_bodies(fast_bodies(paths, self.min_speed), spacing)
+        found = [
+            body for body in joined_bodies(fast_bodies(paths, self.min_speed), spacing)
+            if self._is_missing(body, renderer, frames)
+        ]  # fmt: skip
         room = len(bodies.radii) - bodies.num_bodies
         tracks = [
             (body.track(bodies.num_knots, spacing, FAR * tolerance).to(bodies.tracks), ROOM * body.radius + BORDER)
@@ -144,6 +149,29 @@ class BodySearch:
         return small_wrong_things(
             frames, error_map, error=self.error, resolution=self.resolution, max_share=self.max_share
         )
+
+    def _is_missing(self, body: FastBody, renderer: Renderer, frames: Frames) -> bool:
+        """Whether the model's pictures are wrong all over a body, and not at its edges only.
+
+        What the error map knows of a block are a few pixels. Hands, late in a long training, are wrong at their edges.
+        """
+        pixels = torch.from_numpy(np.concatenate([sighting.pixels for sighting in body.path.sightings.values()]))
+        was_training = renderer.training
+        renderer.eval()
+        errors = []
+        for part in pixels.to(frames.images.device).split(PIXELS_AT_ONCE):
+            rays, rgba = frames.pixels(part)
+            shown = renderer(rays)
+            behind = torch.zeros_like(rays.directions) if shown.background is None else shown.background
+            light, left = shown.rgb, (1 - shown.opacity)[:, None]
+            # A white body is not seen before white.
+            backgrounds = (behind * 0, behind * 0 + 1) if frames.has_alpha else (behind,)
+            errors += [
+                (light + left * (other - behind) - composite_on(rgba, other)).square().mean(-1)
+                for other in backgrounds
+            ]  # fmt: skip
+        renderer.train(was_training)
+        return float(torch.cat(errors).mean()) > self.error
 
     def _home(
         self,

@@ -80,9 +80,16 @@ def _in_frame(
                 angle=side * (len(places) / np.pi) ** 0.5 / focal_x / length,
                 color=color.double().numpy(),
                 is_alone=int((around & matter).sum()) <= BESIDE * int(around.sum()),
+                pixels=_pixels(frames, number, is_it.nonzero() * side + side // 2),
             )
         )
     return found
+
+
+def _pixels(frames: Frames, number: int, places: Tensor) -> np.ndarray:
+    """Numbers, as `Frames.pixels` takes them, of rows and columns (P, 2) of a frame."""
+    height, width = frames.images.shape[1:3]
+    return ((number * height + places[:, 0]) * width + places[:, 1]).numpy()
 
 
 def _opacity(small: Tensor, frames: Frames) -> Tensor:

@@ -1,7 +1,7 @@
 """Paths of small bodies from where single pictures, each of another time and camera, show them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -34,6 +34,7 @@ class Sighting:
         angle: half of its width as the camera sees it, in radians.
         color: (3,).
         is_alone: whether nothing else is beside it in the picture.
+        pixels: (P,) int64, some of its pixels, see `Frames.pixels`; none if nobody asks for them.
     """
 
     time: float
@@ -42,6 +43,7 @@ class Sighting:
     angle: float
     color: Array
     is_alone: bool = True
+    pixels: Array = field(default_factory=lambda: np.empty(0, np.int64))
 
     @property
     def across(self) -> Array:

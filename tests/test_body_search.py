@@ -283,6 +283,22 @@ def test_nothing_is_carried_where_nothing_is_wrong_or_known_or_volumes_have_join
         assert bodies_of(renderer).was_searched
 
 
+@pytest.mark.parametrize("is_white", [True, False])
+def test_what_pictures_show_but_for_its_edges_is_not_carried(frames: Frames, is_white: bool) -> None:
+    """Blocks of the map know a pixel or two. A body that is missing is carried, be it as white as what is behind it."""
+    color = (1.0, 1.0, 1.0) if is_white else RED
+    scene = AnalyticScene([Body(Ball(0.12), Plain(color), FAST, 200.0)], box=BOX)
+    pictures = SyntheticData(scene, 48, num_train=NUM_FRAMES).frames("train")
+    found = []
+    for canonical in (scene, GridField(BOX, (4, 8), 2, hidden_features=16, density_shift=-3.0)):
+        field = DeformedField(IdentityDeformation(), canonical, bodies=CarriedBodies(4, NUM_FRAMES))
+        renderer = Renderer(field, OccupancySampler(BOX, 0.03, 24, num_probes=512, pad_to=1), RandomBackground())
+        renderer.train()
+        found.append(BodySearch(BOX)(200, renderer, pictures, wrong_where_matter_is(pictures)))
+        assert renderer.training
+    assert found == [False, True]
+
+
 def test_opaque_pictures_tell_as_much(frames: Frames) -> None:
     picture = frames.images.float()
     on_white = (picture[..., :3] + 255 - picture[..., 3:]).round().to(torch.uint8)
