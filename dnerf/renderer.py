@@ -13,7 +13,7 @@ from dnerf.cameras import Camera
 from dnerf.checks import check_choice, check_positive
 from dnerf.compositing import Rendering, composite, safe_divide
 from dnerf.deformations.frame_lattice import FrozenDeformation
-from dnerf.fields.base import RadianceField, ask_along
+from dnerf.fields.base import PAD_TO, RadianceField, ask_along
 from dnerf.frame_graphs import FrameGraphs
 from dnerf.kernels import few_nonzero
 from dnerf.quadrature import check_rule
@@ -24,7 +24,6 @@ from dnerf.tracing import FrameTracer
 
 logger = logging.getLogger(__name__)
 
-PAD_TO = 2048  # samples; see `Samples.padded`
 FRAMES_THAT_SHARE = 16  # from so many on a sequence has gained what keeping things between its frames costs
 MOST_TO_SHARE = 0.1  # of space, in which samples fall: haze is dearer to keep than to ask
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
@@ -135,11 +134,11 @@ class Renderer(nn.Module):
                 return self._render(rays, samples, field)
             if not self._ends_early:
                 return self._render(rays, samples.padded(PAD_TO), field)
-            source = packed = PackedRounds(samples, PAD_TO)
+            source = packed = PackedRounds(samples)
             numbers = packed.rays
 
         def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
-            chosen = rays[ray_numbers]
+            chosen = _of(rays, ray_numbers)
             with self.autocast(rays.origins.device):
                 if refines:
                     part, output = self.sampler.refined(part, chosen, field, transmittance, self.stop_transmittance)
@@ -169,11 +168,11 @@ class Renderer(nn.Module):
         begins = rays.near.clone()
 
         def source(numbers: Tensor, taken: int, size: int) -> tuple[Samples, Tensor]:
-            part = self.sampler.first(replace(rays[numbers], near=begins[numbers]), size)
+            part = self.sampler.first(replace(_of(rays, numbers), near=begins[numbers]), size)
             assert part is not None
             is_full = part.offsets.diff() == size
             begins[numbers[is_full]] = part.ends[part.offsets[1:][is_full] - 1]
-            return part.padded(PAD_TO), is_full
+            return part, is_full
 
         return None if self.sampler.first(rays[:0], 1) is None else source
 
@@ -327,3 +326,8 @@ class Renderer(nn.Module):
 def _columns(shown: Rendering) -> Tensor:
     """Colour, opacity and depth (R, 5)."""
     return torch.cat([shown.rgb, shown.opacity[:, None], shown.depth[:, None]], dim=-1)
+
+
+def _of(rays: Rays, numbers: Tensor) -> Rays:
+    """Those with such numbers, all different and in order: all of them as they are."""
+    return rays if len(numbers) == len(rays) else rays[numbers]

@@ -145,8 +145,8 @@ class FrozenDeformation(Deformation):
             rays.origins, rays.directions, ray_indices, distances, self.displacements, self.is_known.shape, self.low,
             self.sides,
         )  # fmt: skip
-        rest = few_nonzero(canonical[:, 0].isnan())
-        if len(rest):
+        if not bool(canonical.sum().isfinite()):  # one sum is quicker than looking at each
+            rest = few_nonzero(canonical[:, 0].isnan())
             positions, _, times = rays.places(ray_indices[rest], distances[rest])
             canonical[rest] = self(positions, times).to(canonical.dtype)
         return canonical

@@ -9,6 +9,7 @@ from dnerf.compositing import FieldOutput
 from dnerf.rays import Rays
 
 MOST_AT_ONCE = 1 << 17  # places that `ask_along` asks in one go: bounds the memory, in haze
+PAD_TO = 2048  # places: matrix libraries compile code for every new number of rows
 
 
 class RadianceField(nn.Module, ABC):
@@ -111,7 +112,7 @@ class RadianceField(nn.Module, ABC):
 
 
 def ask_along(
-    field: RadianceField, rays: Rays, ray_indices: Tensor, distances: Tensor, *, pad_to: int = 1
+    field: RadianceField, rays: Rays, ray_indices: Tensor, distances: Tensor, *, pad_to: int = PAD_TO
 ) -> FieldOutput:
     """Density (N,) and rgb (N, 3) of a field along rays, at most `MOST_AT_ONCE` places at a time, without extras.
 
@@ -120,7 +121,7 @@ def ask_along(
         rays: R rays.
         ray_indices: (N,) int64, the ray of each place.
         distances: (N,) along it, in world units.
-        pad_to: a multiple of so many places is asked: matrix libraries compile code for every new number of rows.
+        pad_to: a multiple of so many places is asked.
     """
     count = len(distances)
     padding = -count % pad_to if count else 0

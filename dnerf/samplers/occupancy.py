@@ -166,7 +166,7 @@ class OccupancySampler(OccupancyGrid):
         What is known is not asked again: whole intervals, and parts in whose middle their interval's is.
         """
         assert samples.ray_indices is not None
-        known = ask_along(field, rays, samples.ray_indices, samples.distances)
+        known = ask_along(field, rays, samples.ray_indices, samples.distances, pad_to=self.pad_to)
         if self.render_splits == 1:
             return samples, known
         parts = seen_parts(
