@@ -44,14 +44,15 @@ class BodySearch:
     no gradient leads a deformation to it. But single pictures show it, as a patch of wrong pixels where there is
     matter, and rays through the patches of a few frames in a row determine its path (`dnerf.trajectories`). What is
     found that way, and is too fast to be found by gradients, is given to the field's `CarriedBodies`: matter that moves
-    along that path, of which nothing else is known yet. Which pixels are wrong is known from the `ErrorMap`; nothing is
-    rendered. Where space-time volumes have joined, they show such bodies, and nothing is looked for.
+    along that path, of which nothing else is known yet. Which pixels are wrong is known from the `ErrorMap`; only
+    the pixels of what would be carried are rendered, to see whether they are wrong indeed. Where space-time volumes
+    have joined, they show such bodies, and nothing is looked for.
 
     Args:
         box: (2, 3) corners of where bodies may be, and homes are made, in world units.
         begin: progress of training, in [0, 1), from which it is due, once all frames are in; never in the last tenth.
         min_steps: before which it is not: until then everything is wrong.
-        error: mean squared error of colours from which a block of pixels is wrong.
+        error: mean squared error of colours from which a block of pixels is wrong, and a body lacks.
         resolution: about which pictures are reduced to, in pixels along the longer side.
         max_share: of a picture, that a sighting may fill.
         min_speed: radii that a body moves between two frames, from which it is too fast.
