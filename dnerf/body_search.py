@@ -52,7 +52,7 @@ class BodySearch:
         box: (2, 3) corners of where bodies may be, and homes are made, in world units.
         begin: progress of training, in [0, 1), from which it is due, once all frames are in; never in the last tenth.
         min_steps: before which it is not: until then everything is wrong.
-        error: mean squared error of colours from which a block of pixels is wrong, and a body lacks.
+        error: mean squared error of colours from which a block of pixels is wrong, and so is a body.
         resolution: about which pictures are reduced to, in pixels along the longer side.
         max_share: of a picture, that a sighting may fill.
         min_speed: radii that a body moves between two frames, from which it is too fast.
