@@ -27,8 +27,10 @@ def lattice_places(
     low: Tensor,
     sides: Tensor,
 ) -> Tensor:
-    if len(ray_indices) and not 0 <= int(ray_indices.min()) <= int(ray_indices.max()) < len(origins):
-        raise ValueError(f"ray_indices must lie in [0, {len(origins)})")
+    if len(ray_indices):
+        first, last = (int(x) for x in ray_indices.aminmax())
+        if first < 0 or last >= len(origins):
+            raise ValueError(f"ray_indices must lie in [0, {len(origins)}), got {first} to {last}")
     out = origins.new_empty(len(distances), 3)
     o, d, rays, t, table, low_, sides_ = (
         x.detach().contiguous().numpy()
