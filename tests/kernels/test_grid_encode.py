@@ -263,3 +263,12 @@ def test_nothing_is_rounded_where_gradients_are_recorded_or_in_double_precision(
 def test_opcheck_of_rounded_features():
     positions, table = example(6, dtype=torch.float32)
     torch.library.opcheck(torch.ops.dnerf.grid_encode_rounded.default, (positions, table, LEVELS.cells, 256))
+
+
+@pytest.mark.parametrize("backend", ["numba", "reference"])
+def test_features_half_way_between_two_are_rounded_to_the_even_one(backend):
+    levels = GridLevels((2,), 32)
+    table = (1 + torch.arange(8) * 2.0**-8).expand(27, 8).contiguous()  # steps of bfloat16 at 1 are 2^-7
+    with kernels.use_backend(backend), torch.no_grad():
+        rounded = grid_encode(torch.zeros(1, 3), table, levels, rounded=True)
+    assert ((rounded[0].float() - 1) * 2**7).tolist() == [0, 0, 1, 2, 2, 2, 3, 4]
