@@ -157,21 +157,18 @@ class BodySearch:
         What the error map knows of a block are a few pixels. Hands, late in a long training, are wrong at their edges.
         """
         pixels = torch.from_numpy(np.concatenate([sighting.pixels for sighting in body.path.sightings.values()]))
-        was_training = renderer.training
-        renderer.eval()
         errors = []
+        renderer.eval()
         for part in pixels.to(frames.images.device).split(PIXELS_AT_ONCE):
             rays, rgba = frames.pixels(part)
             shown = renderer(rays)
             behind = torch.zeros_like(rays.directions) if shown.background is None else shown.background
             light, left = shown.rgb, (1 - shown.opacity)[:, None]
             # A white body is not seen before white.
-            backgrounds = (behind * 0, behind * 0 + 1) if frames.has_alpha else (behind,)
-            errors += [
-                (light + left * (other - behind) - composite_on(rgba, other)).square().mean(-1)
-                for other in backgrounds
-            ]  # fmt: skip
-        renderer.train(was_training)
+            others = (torch.zeros_like(behind), torch.ones_like(behind)) if frames.has_alpha else (behind,)
+            for other in others:
+                errors.append((light + left * (other - behind) - composite_on(rgba, other)).square().mean(-1))
+        renderer.train()
         return float(torch.cat(errors).mean()) > self.error
 
     def _home(

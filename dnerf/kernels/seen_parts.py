@@ -5,6 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dnerf.rays import parts_of
+
 from .backend import choose, run_compiled
 from .packed_weights import packed_weights
 
@@ -87,10 +89,9 @@ def seen_parts_reference(
     rays = torch.repeat_interleave(offsets.diff())
     weights = packed_weights(density * (ends - starts), offsets) * light[rays]
     counts = torch.where(weights <= min_weight, 0, torch.where(weights <= split_weight, 1, splits))
-    whole = torch.repeat_interleave(counts)
+    whole, number = parts_of(counts)
     before = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-    number, parts = torch.arange(len(whole), device=whole.device) - before[whole], counts[whole]
-    first, last = starts[whole], ends[whole]
+    first, last, parts = starts[whole], ends[whole], counts[whole]
     return SeenParts(
         starts=torch.lerp(first, last, number / parts.to(first.dtype)),  # exact at both ends
         ends=torch.lerp(first, last, (number + 1) / parts.to(first.dtype)),

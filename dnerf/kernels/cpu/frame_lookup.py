@@ -50,14 +50,10 @@ def brick_at(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) 
     """Whether a distance lies in a brick that exists, or why not; its cell; and the place, in cells."""
     displacements, is_known, low, sides, lanes = lattice
     slots, _, brick_low, cells_per_unit = contents[:4]
-    is_in, (px, py, pz), (x, y, z), (u, v, w) = place_at(middle, course, is_known, low, sides)
+    is_in, (px, py, pz), (x, y, z), fractions = place_at(middle, course[:2], is_known.shape, low, sides)
     if not is_in:
         return ELSEWHERE, (x, y, z), (px, py, pz)
-    _, ly, lx = is_known.shape
-    a = np.int64(x + lx * (y + ly * z))
-    b, c = a + lx, a + lx * ly
-    d = c + lx
-    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, lanes)
+    blend_vertices(displacements, is_known.shape, (x, y, z), fractions, moved, lanes)
     if math.isnan(moved[0]):
         return LACKS_VERTEX, (x, y, z), (px, py, pz)
     px = (px + moved[0] - brick_low[0]) * cells_per_unit
@@ -71,14 +67,27 @@ def brick_at(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) 
 
 
 @njit(forceinline=True, **BORROWS)
-def place_at(middle: Any, course: Any, is_known: Any, low: Any, sides: Any) -> Any:
-    """Whether a distance lies in the lattice, its position, its cell there, and the fractions in the cell."""
-    (ox, oy, oz), (dx, dy, dz) = course[:2]
+def blend_vertices(displacements: Any, shape: Any, cell: Any, fractions: Any, moved: Any, lanes: Any) -> None:
+    """Interpolate in a cell of a lattice of (z, y, x) vertices; `moved` gets the row."""
+    x, y, z = cell
+    u, v, w = fractions
+    _, ly, lx = shape
+    a = np.int64(x + lx * (y + ly * z))
+    b, c = a + lx, a + lx * ly
+    d = c + lx
+    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, lanes)
+
+
+@njit(forceinline=True, **BORROWS)
+def place_at(middle: Any, ray: Any, shape: Any, low: Any, sides: Any) -> Any:
+    """Whether a distance along a ray lies in a lattice of (z, y, x) vertices, its position, its cell there, and the
+    fractions in the cell."""
+    (ox, oy, oz), (dx, dy, dz) = ray
     one, zero = np.float32(1), np.float32(0)
     px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
     u, v, w = (px - low[0]) / sides[0], (py - low[1]) / sides[1], (pz - low[2]) / sides[2]
     is_in = zero <= u <= one and zero <= v <= one and zero <= w <= one
-    lz, ly, lx = is_known.shape
+    lz, ly, lx = shape
     x, u = locate(u, lx - 1)
     y, v = locate(v, ly - 1)
     z, w = locate(w, lz - 1)

@@ -9,9 +9,8 @@ from numba import prange
 from torch import Tensor
 
 from .course import LINE
-from .grid_encode import locate, trilinear_weights
+from .frame_lookup import blend_vertices, place_at
 from .launch import BORROWS, kernel, launch, num_threads
-from .rows import blend_rows
 from .tasks import next_task, none_taken
 
 PLACES_AT_ONCE = 512  # dealt out to threads
@@ -58,28 +57,19 @@ def _places(
     taken: Any,
     lanes: Any,
 ) -> None:
-    one, zero = np.float32(1), np.float32(0)
-    _, ly, lx = shape
     for worker in prange(len(scratch)):
         moved = scratch[worker]
         first = next_task(taken) * PLACES_AT_ONCE
         while first < len(distances):
             for i in range(first, min(first + PLACES_AT_ONCE, len(distances))):
-                r, t = ray_indices[i], distances[i]
-                px = origins[r, 0] + t * directions[r, 0]
-                py = origins[r, 1] + t * directions[r, 1]
-                pz = origins[r, 2] + t * directions[r, 2]
-                u, v, w = (px - low[0]) / sides[0], (py - low[1]) / sides[1], (pz - low[2]) / sides[2]
-                if not (zero <= u <= one and zero <= v <= one and zero <= w <= one):
-                    out[i, 0] = out[i, 1] = out[i, 2] = np.float32(np.nan)
-                    continue
-                x, u = locate(u, lx - 1)
-                y, v = locate(v, ly - 1)
-                z, w = locate(w, shape[0] - 1)
-                a = np.int64(x + lx * (y + ly * z))
-                b, c = a + lx, a + lx * ly
-                e = c + lx
-                rows = (a, a + 1, b, b + 1, c, c + 1, e, e + 1)
-                blend_rows(displacements, rows, trilinear_weights(u, v, w), moved, 0, lanes)
-                out[i, 0], out[i, 1], out[i, 2] = px + moved[0], py + moved[1], pz + moved[2]
+                r = ray_indices[i]
+                ray = (
+                    (origins[r, 0], origins[r, 1], origins[r, 2]),
+                    (directions[r, 0], directions[r, 1], directions[r, 2]),
+                )
+                is_in, place, cell, fractions = place_at(distances[i], ray, shape, low, sides)
+                if is_in:
+                    blend_vertices(displacements, shape, cell, fractions, moved, lanes)
+                for axis in range(3):
+                    out[i, axis] = place[axis] + moved[axis] if is_in else np.float32(np.nan)
             first = next_task(taken) * PLACES_AT_ONCE

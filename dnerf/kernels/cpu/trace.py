@@ -287,7 +287,7 @@ def _mark_ahead(
         length = (end - start) / np.float32(splits)
         for k in range(splits + 1):  # the parts' middles, then that of the whole
             middle = np.float32(0.5) * (start + end) if k == splits else _part(start, k, length)
-            is_in, _, (x, y, z), _ = place_at(middle, course, is_known, low, sides)
+            is_in, _, (x, y, z), _ = place_at(middle, course[:2], is_known.shape, low, sides)
             if is_in:
                 _mark(vertices, is_known, x, y, z)
         bits &= bits - np.uint64(1)
