@@ -15,6 +15,8 @@ from dnerf.benchmarks.machine import Rates
 
 COUNTED_FREE = ("empty", "new_empty", "empty_like", "empty_strided", "detach", "alias")
 """Operations that touch no memory."""
+LAYER = "mkldnn::_linear_pointwise"
+"""oneDNN's product, bias and activation in one (`dnerf.kernels.relu_layers`); torch counts no flops of it."""
 
 
 @dataclass
@@ -65,8 +67,11 @@ class OperationCounter(TorchDispatchMode):
         is_in_place = {id(x) for x in written_in_place}
         fresh = [x for x in outputs if id(x) not in is_in_place]
         num_bytes = sum(_touched_bytes(x) for x in (*inputs, *fresh, *written_in_place))
-        counter = flop_registry.get(func._overloadpacket)
-        flops = 0 if counter is None else counter(*args, **kwargs, out_val=result)
+        if name == LAYER:
+            flops = 2 * result.numel() * args[0].shape[-1]
+        else:
+            counter = flop_registry.get(func._overloadpacket)
+            flops = 0 if counter is None else counter(*args, **kwargs, out_val=result)
         rate = self.rates.flops.get(inputs[0].dtype, math.inf) if inputs else math.inf
         work = self.work[name]
         work.calls += 1

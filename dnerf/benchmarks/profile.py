@@ -9,7 +9,7 @@ import torch
 from torch.profiler import ProfilerActivity, record_function
 
 from dnerf.benchmarks.machine import Rates, measure_rates
-from dnerf.benchmarks.operations import OperationCounter, Work, total
+from dnerf.benchmarks.operations import LAYER, OperationCounter, Work, total
 from dnerf.benchmarks.scenes import scene_overrides
 from dnerf.benchmarks.suite import BarPlot, Settings, SuiteResult, Table
 from dnerf.benchmarks.timing import Timing, summarize
@@ -21,8 +21,10 @@ UPDATE = "occupancy update"
 BETWEEN = "Python and dispatch between operations"
 OTHER = "other element-wise operations"
 PARTS: dict[str, tuple[str, ...]] = {
-    "matrix products": ("aten::mm", "aten::addmm", "aten::bmm", "aten::_addmm_activation"),
-    "grid encoding, forward": ("dnerf::grid_encode",),
+    "matrix products": (
+        "aten::mm", "aten::addmm", "aten::bmm", "aten::baddbmm", "aten::_addmm_activation", LAYER,
+    ),
+    "grid encoding, forward": ("dnerf::grid_encode", "dnerf::grid_encode_rounded"),
     "grid encoding, gradient to the table": ("dnerf::grid_encode_grad_table",),
     "grid encoding, gradient to positions": ("dnerf::grid_encode_grad_positions",),
     "marching rays": ("dnerf::march",),

@@ -8,12 +8,13 @@ import torch
 from dnerf.benchmarks import Settings, run_suite
 from dnerf.benchmarks.kernel_cases import RESOLUTIONS
 from dnerf.benchmarks.machine import Rates
-from dnerf.benchmarks.operations import OperationCounter
+from dnerf.benchmarks.operations import LAYER, OperationCounter
 from dnerf.benchmarks.plain_kernels import plain_grid_encode, plain_packed_weights
+from dnerf.benchmarks.profile import PARTS
 from dnerf.benchmarks.quadrature import samples_needed
 from dnerf.benchmarks.scaling import measure
 from dnerf.benchmarks.smooth import SmoothClouds, exact_smooth
-from dnerf.kernels import GridLevels, grid_encode, packed_weights
+from dnerf.kernels import GridLevels, grid_encode, is_bfloat16_wanted, packed_weights, relu_layers
 from dnerf.rays import Rays
 
 RATES = Rates({torch.float32: 1e9}, bandwidth=1e9, cached_bandwidth=1e9)
@@ -52,6 +53,26 @@ def test_operations_are_counted_with_their_bytes_and_products():
     assert mm.seconds == pytest.approx(max(mm.flops, mm.num_bytes) / 1e9)
     relu = counter.work["aten::relu"]
     assert relu.num_bytes == 2 * 4 * 8 * 4
+
+
+def test_products_of_fused_layers_are_counted():
+    inputs = torch.rand(32, 16)
+    weights, biases = [torch.rand(24, 16), torch.rand(8, 24)], [torch.rand(24), torch.rand(8)]
+    counter = OperationCounter(RATES)
+    with counter, torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        if not is_bfloat16_wanted(inputs):
+            pytest.skip("oneDNN has no bfloat16 on this processor")
+        relu_layers(inputs, weights, biases)
+    assert counter.work[LAYER].calls == 2
+    assert counter.work[LAYER].flops == 2 * 32 * (16 * 24 + 24 * 8)
+
+
+def test_profile_names_the_part_of_every_kernel_that_training_runs():
+    of_pictures = {"dnerf::brick_lookup", "dnerf::trace", "dnerf::march_to_size"}
+    kernels = {name for name in torch._C._dispatch_get_all_op_names() if name.startswith("dnerf::")}
+    named = {name for names in PARTS.values() for name in names}
+    assert of_pictures < kernels
+    assert kernels - of_pictures <= named
 
 
 def test_updates_in_place_are_written_and_views_are_free():
