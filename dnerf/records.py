@@ -24,7 +24,7 @@ class TrainingRecord:
         losses: each loss term of the step by name; "loss" is what it minimised, see `Trainer`'s `loss_every`.
         psnr: of the batch's colours, in dB; with an error map of rays that are harder than others.
         num_rays: rays of the batch.
-        num_samples: field evaluations of the batch.
+        num_samples: that its rays were rendered from, padding aside.
         learning_rate_factor: of the schedule, in [0, 1].
     """
 
@@ -44,7 +44,7 @@ class Outcome:
     Args:
         scalars: loss terms, "loss" and "mse", on the device.
         weight: of this process's share of the rays in the mean over processes.
-        num_samples: field evaluations of the share.
+        num_samples: that the share was rendered from, padding aside.
         learning_rate_factor: of the schedule, in [0, 1].
     """
 

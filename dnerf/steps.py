@@ -86,7 +86,8 @@ class Steps:
         Returns:
             Scalars on the device: the terms whose turn it is, "loss", "mse" and what else was asked for; and the
             squared errors (R,) of the pixels, -1 where a ray found no places; they hold until the next step. And the
-            number of samples; of a fixed number of places, how many were wanted when that was last looked at.
+            number of samples, padding aside; of a fixed number of places, how many were wanted when that was last
+            looked at.
         """
         turns = [name for name in self.losses if number % self.loss_every.get(name, 1) == 0]
 
@@ -128,7 +129,8 @@ class Steps:
         assert rendering.background is not None
         assert rendering.samples is not None
         if self.fixed is None:
-            self._num_samples = rendering.samples.starts.numel()
+            # Without what they were padded with: few samples would pass for many.
+            self._num_samples = int((rendering.samples.lengths > 0).sum())
         target = composite_on(rgba, rendering.background)
         terms = {name: self.losses[name](rendering, target, self.renderer) for name in turns}
         total = rendering.rgb.new_zeros(())

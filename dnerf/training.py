@@ -46,7 +46,7 @@ class Trainer:
         num_steps: most optimiser steps.
         max_seconds: most seconds of training, or None; loading, compiling kernels and callbacks do not count.
         num_rays: rays per step, or the first step's if `target_samples` is given.
-        target_samples: field evaluations per step; the number of rays is adapted to it (for samplers that skip empty
+        target_samples: that are rendered per step; the number of rays is adapted to it (for samplers that skip empty
             space: rays that meet nothing cost nothing).
         max_rays: bound of the adapted number of rays.
         learning_rates: by parameter-name prefix of the renderer, in which * stands for anything ("" is the default, the

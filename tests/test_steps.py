@@ -289,6 +289,17 @@ def test_rays_adapt_to_the_wanted_samples_by_a_factor_of_two_at_most(num_rays, n
     assert next_num_rays(num_rays, num_samples, 1000, 300, is_fixed=False, step=7) == expected
 
 
+def test_padding_does_not_pass_for_samples(frames: Frames) -> None:
+    renderer = small_renderer()
+    renderer.sampler.pad_to = 4096  # more than is wanted: counted, it would leave one ray
+    seen: list[TrainingRecord] = []
+    trainer = Trainer(num_steps=40, num_rays=64, target_samples=1024, log_every=1, progress_bar=False)
+    trainer.fit(renderer, frames, callbacks=[lambda record, _: seen.append(record)])
+    late = seen[20:]
+    assert 0.5 < sum(record.num_samples for record in late) / len(late) / 1024 < 1.5
+    assert min(record.num_rays for record in late) > 8
+
+
 def test_with_fixed_places_rays_change_only_when_it_is_known_how_full_they_are():
     unknown, known = (
         next_num_rays(5000, 400, 1000, 1 << 20, is_fixed=True, step=step) for step in (LOOK_EVERY - 1, LOOK_EVERY)
