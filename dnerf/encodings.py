@@ -68,6 +68,53 @@ class SinusoidalEncoding(nn.Module):
         return [values, *waves] if self.include_input else waves
 
 
+class TimeEncoding(nn.Module):
+    """Waves of a time, then what is learnt of each moment by itself: features of knots, evenly spaced, linear between.
+
+    Waves (`SinusoidalEncoding`) are smooth and say something of all times. What happens within a frame or two, as when
+    a ball bounces, a network finds in them slowly, and more octaves ripple everywhere. Features of knots are of their
+    moment alone. They begin at zero and stay there at times that are never asked.
+
+    Source: the latent codes of frames in Nerfies (arXiv 2011.12948) and DyNeRF (arXiv 2103.02597), here beside waves
+    and defined between frames, too.
+
+    Args:
+        num_frequencies: octaves of the waves, >= 0.
+        num_knots: K, from time 0 to time 1; 0 for none, else at least 2.
+        num_features: F of a knot.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(self, num_frequencies: int, num_knots: int = 0, num_features: int = 4) -> None:
+        super().__init__()
+        if num_knots < 0 or num_knots == 1:
+            raise ValueError(f"num_knots must be 0 or at least 2, got {num_knots}")
+        check_positive("num_features", num_features)
+        self.waves = SinusoidalEncoding(1, num_frequencies)
+        self.knots = nn.Parameter(torch.zeros(num_knots, num_features)) if num_knots else None
+        self.out_features = self.waves.out_features + (num_features if num_knots else 0)
+
+    def forward(self, times: Tensor) -> Tensor:
+        """Encode times (..., 1) -> (..., 2 num_frequencies + 1 + F), in their dtype; those outside [0, 1] see its ends'
+        features."""
+        return torch.cat(self.parts(times), dim=-1)
+
+    def parts(self, times: Tensor) -> list[Tensor]:
+        """What `forward` puts together, for callers who put more together in one go."""
+        waves = self.waves.parts(times)
+        return waves if self.knots is None else [*waves, self._features(self.knots, times)]
+
+    def _features(self, knots: Tensor, times: Tensor) -> Tensor:
+        last = len(knots) - 1
+        places = times.clamp(0, 1) * last
+        lower = places.detach().long().clamp_(0, last - 1)  # of NaN: some knot, and a share that is NaN
+        before, after = (knots.index_select(0, (lower + i).flatten()) for i in (0, 1))
+        shape = (*times.shape[:-1], knots.shape[1])
+        return torch.lerp(before.view(shape).to(times.dtype), after.view(shape).to(times.dtype), places - lower)
+
+
 class SphericalHarmonicsEncoding(nn.Module):
     """Real spherical harmonics of a unit direction up to a degree: (degree + 1)^2 numbers.
 

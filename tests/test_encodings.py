@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from reference import sinusoidal, sphere_quadrature
 
-from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
+from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding, TimeEncoding
 
 
 @pytest.mark.parametrize("num_dims", [1, 3])
@@ -58,6 +59,70 @@ def test_progress_changes_nothing_without_a_window() -> None:
     encoding.set_progress(0.0)
     assert torch.equal(encoding(values), before)
     assert encoding.state_dict() == {}
+
+
+def with_knots(num_knots: int = 5, num_features: int = 2) -> TimeEncoding:
+    encoding = TimeEncoding(3, num_knots, num_features).double()
+    assert encoding.knots is not None
+    torch.nn.init.normal_(encoding.knots)
+    return encoding
+
+
+def test_features_of_knots_are_linear_in_between() -> None:
+    encoding, times = with_knots(), torch.linspace(-0.2, 1.2, 57, dtype=torch.float64)[:, None]
+    encoded = encoding(times)
+    assert encoded.shape == (57, encoding.out_features)
+    assert torch.equal(encoded[:, :7], SinusoidalEncoding(1, 3)(times))
+    assert encoding.knots is not None
+    knots = encoding.knots.detach().numpy()
+    expected = [np.interp(times[:, 0], np.linspace(0, 1, 5), column) for column in knots.T]  # ends are held
+    torch.testing.assert_close(encoded[:, 7:].detach(), torch.from_numpy(np.stack(expected, -1)), rtol=0, atol=1e-14)
+
+
+def test_a_moment_teaches_the_two_knots_beside_it() -> None:
+    encoding = with_knots()
+    encoding(torch.tensor([[[0.6]], [[0.7]]], dtype=torch.float64)).sum().backward()
+    assert encoding.knots is not None
+    assert encoding.knots.grad is not None
+    expected = torch.tensor([0, 0, 0.6 + 0.2, 0.4 + 0.8, 0], dtype=torch.float64)[:, None].expand(5, 2)
+    torch.testing.assert_close(encoding.knots.grad, expected, rtol=0, atol=1e-12)
+
+
+def test_knots_say_nothing_until_they_have_learnt() -> None:
+    encoding, times = TimeEncoding(3, 100, 4), torch.rand(20, 1)
+    assert torch.count_nonzero(encoding(times)[:, 7:]) == 0
+    assert torch.equal(TimeEncoding(3)(times), SinusoidalEncoding(1, 3)(times))
+    assert TimeEncoding(3).state_dict() == {}  # as models of before there were any
+
+
+@pytest.mark.parametrize("shape", [(0, 1), (3, 0, 1), (1,), (2, 3, 1)])
+def test_times_of_any_number_are_encoded(shape: tuple[int, ...]) -> None:
+    assert with_knots()(torch.rand(shape, dtype=torch.float64)).shape == (*shape[:-1], 9)
+
+
+def test_features_pass_gradients_to_times() -> None:
+    encoding = with_knots()
+    times = torch.tensor([[0.1], [0.33], [0.9]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(encoding, (times,))
+
+
+def test_a_time_that_is_no_number_stays_none() -> None:
+    assert with_knots()(torch.tensor([[math.nan], [0.5]], dtype=torch.float64)).isnan().tolist() == [
+        [True] * 9, [False] * 9,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((3, 1), "num_knots must be 0 or at least 2, got 1"),
+        ((3, -2), "num_knots must be 0 or at least 2, got -2"),
+        ((3, 5, 0), "num_features must be > 0"),
+    ],
+)
+def test_knots_out_of_range_are_refused(arguments: tuple[int, ...], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        TimeEncoding(*arguments)
 
 
 def test_sinusoidal_encoding_of_an_empty_batch_is_empty() -> None:

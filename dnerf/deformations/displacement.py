@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from dnerf.deformations.base import Deformation, check_positions_times
-from dnerf.encodings import SinusoidalEncoding
+from dnerf.encodings import SinusoidalEncoding, TimeEncoding
 from dnerf.geometry import move_by_twists
 from dnerf.mlp import MLP
 
@@ -26,9 +26,11 @@ class DisplacementDeformation(Deformation):
         time_frequencies: octaves of the times' encoding.
         canonical_time: t0 in [0, 1], or None.
         window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
+        time_knots: moments of which features are learnt, see `TimeEncoding`; 0 for none.
+        knot_features: how many of each.
 
     Raises:
-        ValueError: if the canonical time lies outside [0, 1].
+        ValueError: if the canonical time lies outside [0, 1], or for one knot or a number of features out of range.
     """
 
     NUM_OUTPUTS = 3  # of the MLP
@@ -43,13 +45,15 @@ class DisplacementDeformation(Deformation):
         time_frequencies: int = 10,
         canonical_time: float | None = 0.0,
         window_end: float | None = None,
+        time_knots: int = 0,
+        knot_features: int = 4,
     ) -> None:
         super().__init__()
         if canonical_time is not None and not 0 <= canonical_time <= 1:
             raise ValueError(f"canonical_time must be in [0, 1] or None, got {canonical_time}")
         self.canonical_time = canonical_time
         self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
-        self.encode_times = SinusoidalEncoding(1, time_frequencies)
+        self.encode_times = TimeEncoding(time_frequencies, time_knots, knot_features)
         self.mlp = MLP(
             self.encode_positions.out_features + self.encode_times.out_features,
             hidden_features,

@@ -33,6 +33,7 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
     "displacement, no canonical time": lambda: DisplacementDeformation(2, 16, (), canonical_time=None),
     "displacement, canonical time 0.5": lambda: DisplacementDeformation(2, 16, (), canonical_time=0.5),
     "displacement, windowed": lambda: DisplacementDeformation(2, 16, (), window_end=0.5),
+    "displacement, knots of time": lambda: DisplacementDeformation(2, 16, (), time_knots=5, knot_features=2),
     "se3": lambda: SE3Deformation(2, 16, (), position_frequencies=2, canonical_time=None),
     "se3, canonical time": lambda: SE3Deformation(2, 16, (), position_frequencies=2),
     "flow": lambda: FlowDeformation(network_velocity(), 0.5),
@@ -41,6 +42,7 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
         network_velocity(), None, clock="frozen", solver="midpoint", num_steps=1
     ),
     "flow, twists": lambda: FlowDeformation(network_velocity(twists=True), num_steps=4),
+    "flow, knots of time": lambda: FlowDeformation(NetworkVelocity(BOX, 2, 16, time_knots=5), num_steps=4),
     "flow, grid": lambda: FlowDeformation(GridVelocity(BOX, 3, 5), num_steps=4),
     "flow, grid and network": lambda: FlowDeformation(GridVelocity(BOX, 3, 5, hidden_features=8), num_steps=4),
     "flow, curl": lambda: FlowDeformation(CurlVelocity(BOX, 4, 8, max_wavenumber=0.5, time_frequencies=2), num_steps=4),

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dnerf.checks import check_positive
 from dnerf.deformations.velocities.base import BoxWindow, Velocity
-from dnerf.encodings import SinusoidalEncoding
+from dnerf.encodings import SinusoidalEncoding, TimeEncoding
 from dnerf.mlp import MLP
 
 
@@ -31,6 +31,8 @@ class NetworkVelocity(Velocity):
         smoothness: see `BoxWindow`.
         window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
         twists: k in radians per unit of the MLP's output; 0 for a field that gives v itself.
+        time_knots: moments of which features are learnt, see `TimeEncoding`; 0 for none.
+        knot_features: how many of each.
 
     Raises:
         ValueError: for numbers out of range.
@@ -49,6 +51,8 @@ class NetworkVelocity(Velocity):
         smoothness: int = 4,
         window_end: float | None = None,
         twists: float = 0.0,
+        time_knots: int = 0,
+        knot_features: int = 4,
     ) -> None:
         super().__init__()
         check_positive("num_layers", num_layers)
@@ -56,7 +60,7 @@ class NetworkVelocity(Velocity):
         self.twists = float(twists)
         self.window = BoxWindow(box, margin, smoothness)
         self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
-        self.encode_times = SinusoidalEncoding(1, time_frequencies)
+        self.encode_times = TimeEncoding(time_frequencies, time_knots, knot_features)
         self.mlp = MLP(
             self.encode_positions.out_features + self.encode_times.out_features,
             hidden_features,
