@@ -52,7 +52,8 @@ class BodySearch:
         box: (2, 3) corners of where bodies may be, and homes are made, in world units.
         begin: progress of training, in [0, 1), from which it is due, once all frames are in; never in the last tenth.
         min_steps: before which it is not: until then everything is wrong.
-        error: mean squared error of colours from which a block of pixels is wrong, and so is a body.
+        error: mean squared error of colours from which a block of pixels is wrong.
+        missing: squared error above which most pixels of a body have to be.
         resolution: about which pictures are reduced to, in pixels along the longer side.
         max_share: of a picture, that a sighting may fill.
         min_speed: radii that a body moves between two frames, from which it is too fast.
@@ -69,13 +70,15 @@ class BodySearch:
         *,
         min_steps: int = 150,
         error: float = 0.02,
+        missing: float = 0.04,
         resolution: int = 100,
         max_share: float = 0.02,
         min_speed: float = 0.4,
         tolerance: float = 0.033,
     ) -> None:
         for name, value in (
-            ("error", error), ("resolution", resolution), ("max_share", max_share), ("tolerance", tolerance),
+            ("error", error), ("missing", missing), ("resolution", resolution), ("max_share", max_share),
+            ("tolerance", tolerance),
         ):  # fmt: skip
             check_positive(name, value)
         for name, value in (("min_steps", min_steps), ("min_speed", min_speed)):
@@ -86,6 +89,7 @@ class BodySearch:
         self.begin = begin
         self.min_steps = min_steps
         self.error = error
+        self.missing = missing
         self.resolution = resolution
         self.max_share = max_share
         self.min_speed = min_speed
@@ -152,9 +156,10 @@ class BodySearch:
         )
 
     def _is_missing(self, body: FastBody, renderer: Renderer, frames: Frames) -> bool:
-        """Whether the model's pictures are wrong all over a body, and not at its edges only.
+        """Whether the model's pictures are wrong all over a body, and not at its edges only, or beside its place.
 
-        What the error map knows of a block are a few pixels. Hands, late in a long training, are wrong at their edges.
+        What the error map knows of a block are a few pixels. Hands that motion has all but found are wrong at their
+        edges, and the model is left to find them.
         """
         pixels = torch.from_numpy(np.concatenate([sighting.pixels for sighting in body.path.sightings.values()]))
         errors = []
@@ -166,10 +171,10 @@ class BodySearch:
             light, left = shown.rgb, (1 - shown.opacity)[:, None]
             # A white body is not seen before white.
             others = (torch.zeros_like(behind), torch.ones_like(behind)) if frames.has_alpha else (behind,)
-            for other in others:
-                errors.append((light + left * (other - behind) - composite_on(rgba, other)).square().mean(-1))
+            differences = [light + left * (other - behind) - composite_on(rgba, other) for other in others]
+            errors.append(torch.stack(differences).square().mean((0, -1)))
         renderer.train()
-        return float(torch.cat(errors).mean()) > self.error
+        return float(torch.cat(errors).median()) > self.missing
 
     def _home(
         self,

@@ -73,7 +73,8 @@ class TimeEncoding(nn.Module):
 
     Waves (`SinusoidalEncoding`) are smooth and say something of all times. What happens within a frame or two, as when
     a ball bounces, a network finds in them slowly, and more octaves ripple everywhere. Features of knots are of their
-    moment alone. They begin at zero and stay there at times that are never asked.
+    moment alone. They begin at zero and stay there at times that are never asked, if no loss says otherwise
+    (`dnerf.losses.SmoothKnotsLoss`).
 
     Source: the latent codes of frames in Nerfies (arXiv 2011.12948) and DyNeRF (arXiv 2103.02597), here beside waves
     and defined between frames, too.
@@ -105,6 +106,10 @@ class TimeEncoding(nn.Module):
         """What `forward` puts together, for callers who put more together in one go."""
         waves = self.waves.parts(times)
         return waves if self.knots is None else [*waves, self._features(self.knots, times)]
+
+    def roughness(self) -> Tensor:
+        """The mean squared difference () between features of neighbouring knots; 0 without knots."""
+        return self.waves.frequencies.new_zeros(()) if self.knots is None else self.knots.diff(dim=0).square().mean()
 
     def _features(self, knots: Tensor, times: Tensor) -> Tensor:
         last = len(knots) - 1

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from dnerf.checks import as_box, check_choice, check_positive
 from dnerf.compositing import Rendering
+from dnerf.encodings import TimeEncoding
 from dnerf.fields import DeformedField, SpaceTimeVolumes
 from dnerf.renderer import Renderer
 
@@ -252,4 +253,31 @@ class SmoothVolumesLoss(Loss):
             if isinstance(part, SpaceTimeVolumes) and part.has_joined:
                 in_space, in_time = part.roughness()
                 total = total + self.space_weight * in_space + self.time_weight * in_time
+        return total
+
+
+class SmoothKnotsLoss(Loss):
+    """Roughness of what deformations learn of single moments, see `TimeEncoding`: squared differences of neighbours.
+
+    Knots that lie between two frames learn nothing from pictures; with this they are between their neighbours, and
+    after the last frame they are as the last one that was seen.
+
+    Args:
+        weight: factor of their mean.
+
+    Raises:
+        ValueError: for a negative weight.
+    """
+
+    def __init__(self, weight: float = 1e-3) -> None:
+        super().__init__()
+        check_positive("weight", weight, allow_zero=True)
+        self.weight = weight
+
+    def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
+        """See `Loss`; only the field matters here, and one without knots costs nothing."""
+        total = rendering.rgb.new_zeros(())
+        for part in renderer.field.modules():
+            if isinstance(part, TimeEncoding) and part.knots is not None:
+                total = total + self.weight * part.roughness()
         return total

@@ -1,5 +1,6 @@
 """Small fast bodies that training finds in its pictures, and that the field then carries."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -284,19 +285,24 @@ def test_nothing_is_carried_where_nothing_is_wrong_or_known_or_volumes_have_join
 
 
 @pytest.mark.parametrize("is_white", [True, False])
-def test_what_pictures_show_but_for_its_edges_is_not_carried(frames: Frames, is_white: bool) -> None:
+def test_what_pictures_show_about_where_it_is_is_not_carried(frames: Frames, is_white: bool) -> None:
     """Blocks of the map know a pixel or two. A body that is missing is carried, be it as white as what is behind it."""
     color = (1.0, 1.0, 1.0) if is_white else RED
-    scene = AnalyticScene([Body(Ball(0.12), Plain(color), FAST, 200.0)], box=BOX)
+
+    def ball(motion: Orbit) -> AnalyticScene:
+        return AnalyticScene([Body(Ball(0.12), Plain(color), motion, 200.0)], box=BOX)
+
+    scene = ball(FAST)
+    late = ball(replace(FAST, phase=FAST.phase - 0.06 / (2 * math.pi * FAST.radius)))  # by half its radius
     pictures = SyntheticData(scene, 48, num_train=NUM_FRAMES).frames("train")
     found = []
-    for canonical in (scene, GridField(BOX, (4, 8), 2, hidden_features=16, density_shift=-3.0)):
+    for canonical in (scene, late, GridField(BOX, (4, 8), 2, hidden_features=16, density_shift=-3.0)):
         field = DeformedField(IdentityDeformation(), canonical, bodies=CarriedBodies(4, NUM_FRAMES))
         renderer = Renderer(field, OccupancySampler(BOX, 0.03, 24, num_probes=512, pad_to=1), RandomBackground())
         renderer.train()
         found.append(BodySearch(BOX)(200, renderer, pictures, wrong_where_matter_is(pictures)))
         assert renderer.training
-    assert found == [False, True]
+    assert found == [False, False, True]
 
 
 def test_opaque_pictures_tell_as_much(frames: Frames) -> None:
@@ -311,7 +317,14 @@ def test_room_is_limited_and_wrong_numbers_are_refused(frames: Frames) -> None:
     renderer = a_renderer(bodies=CarriedBodies(1, 50))
     assert BodySearch(BOX, min_speed=0.0)(300, renderer, frames, wrong_where_matter_is(frames))
     assert bodies_of(renderer).num_bodies == 1
-    for settings in ({"begin": 0.9}, {"begin": -0.1}, {"error": 0.0}, {"tolerance": -1.0}, {"min_speed": -1.0}):
+    for settings in (
+        {"begin": 0.9},
+        {"begin": -0.1},
+        {"error": 0.0},
+        {"missing": 0.0},
+        {"tolerance": -1.0},
+        {"min_speed": -1.0},
+    ):
         with pytest.raises(ValueError, match=next(iter(settings))):
             BodySearch(BOX, **settings)
     with pytest.raises(ValueError, match="box"):
