@@ -10,7 +10,14 @@ from torch import Tensor
 from dnerf.compositing import FieldOutput, Rendering
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes
-from dnerf.losses import FadingLoss, HiddenMatterLoss, OpacityEntropyLoss, PhotometricLoss, SmoothVolumesLoss
+from dnerf.losses import (
+    FadingLoss,
+    HiddenMatterLoss,
+    OpacityEntropyLoss,
+    PhotometricLoss,
+    SmoothKnotsLoss,
+    SmoothVolumesLoss,
+)
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, StratifiedSampler
 
@@ -266,3 +273,32 @@ def test_rough_volumes_cost_once_they_have_joined() -> None:
     assert SmoothVolumesLoss()(picture(rgb), rgb, RENDERER).item() == 0
     with pytest.raises(ValueError, match="time_weight must be >= 0"):
         SmoothVolumesLoss(time_weight=-1.0)
+
+
+def test_knots_of_which_pictures_say_nothing_are_between_their_neighbours_or_as_the_last() -> None:
+    deformation = DisplacementDeformation(1, 8, (), time_knots=6, knot_features=1)
+    renderer = Renderer(DeformedField(deformation, fog()), StratifiedSampler(4))
+    rgb = torch.rand(2, 3)
+    knots = deformation.encode_times.knots
+    assert knots is not None
+    with torch.no_grad():
+        knots[:, 0] = torch.tensor([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
+    loss = SmoothKnotsLoss(3.0)
+    assert loss(picture(rgb), rgb, renderer).item() == pytest.approx(3.0 * (0.25 + 4.0 + 4.0) / 5, rel=1e-6)
+    optimizer = torch.optim.Adam([knots], lr=0.02)
+    for _ in range(600):
+        optimizer.zero_grad()
+        loss(picture(rgb), rgb, renderer).backward()
+        assert knots.grad is not None
+        knots.grad[[0, 3]] = 0.0  # as those whose frames keep them where they are
+        optimizer.step()
+    expected = torch.tensor([0.5, 1.0, 1.5, 2.0, 2.0, 2.0])
+    torch.testing.assert_close(knots.detach()[:, 0], expected, rtol=0, atol=0.02)
+
+
+def test_what_has_no_knots_is_not_rough() -> None:
+    rgb = torch.rand(2, 3)
+    assert SmoothKnotsLoss()(picture(rgb), rgb, RENDERER).item() == 0
+    assert DisplacementDeformation(1, 8, ()).encode_times.roughness().item() == 0
+    with pytest.raises(ValueError, match="weight must be >= 0"):
+        SmoothKnotsLoss(-1.0)
