@@ -269,7 +269,7 @@ class SmoothKnotsLoss(Loss):
         ValueError: for a negative weight.
     """
 
-    def __init__(self, weight: float = 1e-2) -> None:
+    def __init__(self, weight: float = 1e-3) -> None:
         super().__init__()
         check_positive("weight", weight, allow_zero=True)
         self.weight = weight
