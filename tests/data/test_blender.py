@@ -162,15 +162,17 @@ def test_missing_root_is_refused(tmp_path: Path) -> None:
 
 def test_memory_of_reading_is_that_of_the_result_and_a_few_images(make_scene: Scene) -> None:
     root = make_scene(num_frames=60, height=256, width=256)
-    load_blender(root, "train", 32)
-    tracemalloc.start()
-    frames = load_blender(root, "train", 32)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    peaks = []
+    # Anything else that runs in this process can only add to a peak.
+    for _ in range(3):
+        tracemalloc.start()
+        frames = load_blender(root, "train", 32)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
     assert frames.images.shape == (60, 32, 32, 4)
     # 0.25 MiB for the result, and in each of four threads about 1.5 MiB for an image of 0.25 MiB and its products;
     # all 60 pictures would take 15 MiB as bytes and 60 MiB as floats.
-    assert peak < 10 * 2**20
+    assert min(peaks) < 10 * 2**20
 
 
 @given(num_frames=st.integers(1, 3), channels=st.sampled_from([3, 4]), seed=st.integers(0, 2**31))
