@@ -8,6 +8,8 @@ from torch import Tensor, nn
 from dnerf.checks import check_choice, check_positive
 from dnerf.geometry import check_last_axis
 
+FRAMES_OF_A_KNOT = 2
+
 
 class SinusoidalEncoding(nn.Module):
     """Sines and cosines of a value at doubling frequencies: (x, sin(2^k x), cos(2^k x)), k < num_frequencies.
@@ -74,19 +76,22 @@ class TimeEncoding(nn.Module):
     Waves (`SinusoidalEncoding`) are smooth and say something of all times. What happens within a frame or two, as when
     a ball bounces, a network finds in them slowly, and more octaves ripple everywhere. Features of knots are of their
     moment alone. They begin at zero and stay there at times that are never asked, if no loss says otherwise
-    (`dnerf.losses.SmoothKnotsLoss`).
+    (`dnerf.losses.SmoothKnotsLoss`). How many are in use depends on how many frames there are (`see`): a frame of one
+    camera with a knot of its own is explained by bending it by itself, not by what is seen in others, too.
 
     Source: the latent codes of frames in Nerfies (arXiv 2011.12948) and DyNeRF (arXiv 2103.02597), here beside waves
     and defined between frames, too.
 
     Args:
         num_frequencies: octaves of the waves, >= 0.
-        num_knots: K, from time 0 to time 1; 0 for none, else at least 2.
+        num_knots: K, from time 0 to time 1, all in use until `see` says otherwise; 0 for none, else at least 2.
         num_features: F of a knot.
 
     Raises:
         ValueError: for numbers out of range.
     """
+
+    num_used: Tensor
 
     def __init__(self, num_frequencies: int, num_knots: int = 0, num_features: int = 4) -> None:
         super().__init__()
@@ -95,7 +100,20 @@ class TimeEncoding(nn.Module):
         check_positive("num_features", num_features)
         self.waves = SinusoidalEncoding(1, num_frequencies)
         self.knots = nn.Parameter(torch.zeros(num_knots, num_features)) if num_knots else None
+        if num_knots:
+            self.register_buffer("num_used", torch.tensor(num_knots))
         self.out_features = self.waves.out_features + (num_features if num_knots else 0)
+
+    @torch.no_grad()
+    def see(self, times: Tensor) -> None:
+        """Use half as many knots as there are frames, and at most one for each moment.
+
+        Args:
+            times: (F,) of the frames that training has.
+        """
+        if self.knots is not None:
+            wanted = min(len(times) // FRAMES_OF_A_KNOT, len(times.unique()))
+            self.num_used.fill_(min(max(wanted, 2), len(self.knots)))
 
     def forward(self, times: Tensor) -> Tensor:
         """Encode times (..., 1) -> (..., 2 num_frequencies + 1 + F), in their dtype; those outside [0, 1] see its ends'
@@ -108,13 +126,18 @@ class TimeEncoding(nn.Module):
         return waves if self.knots is None else [*waves, self._features(self.knots, times)]
 
     def roughness(self) -> Tensor:
-        """The mean squared difference () between features of neighbouring knots; 0 without knots."""
-        return self.waves.frequencies.new_zeros(()) if self.knots is None else self.knots.diff(dim=0).square().mean()
+        """The mean squared difference () between features of neighbouring knots in use; 0 without knots."""
+        if self.knots is None:
+            return self.waves.frequencies.new_zeros(())
+        last = self.num_used - 1
+        is_used = torch.arange(len(self.knots) - 1, device=last.device) < last
+        return self.knots.diff(dim=0).square().mean(dim=1).mul(is_used).sum() / last
 
     def _features(self, knots: Tensor, times: Tensor) -> Tensor:
-        last = len(knots) - 1
-        places = times.clamp(0, 1) * last
-        lower = places.detach().long().clamp_(0, last - 1)  # of NaN: some knot, and a share that is NaN
+        last = self.num_used - 1
+        places = times.clamp(0, 1) * last.to(times.dtype)
+        # Of NaN: some knot, and a share that is NaN.
+        lower = torch.minimum(places.detach().long().clamp_(min=0), last - 1)
         before, after = (knots.index_select(0, (lower + i).flatten()) for i in (0, 1))
         shape = (*times.shape[:-1], knots.shape[1])
         return torch.lerp(before.view(shape).to(times.dtype), after.view(shape).to(times.dtype), places - lower)

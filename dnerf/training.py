@@ -15,6 +15,7 @@ from dnerf.box_check import BoxCheck
 from dnerf.checks import check_choice, check_mapping, check_positive
 from dnerf.data.frames import Frames
 from dnerf.distributed import Processes
+from dnerf.encodings import TimeEncoding
 from dnerf.error_map import ErrorMap, draw_pixels
 from dnerf.graphs import GraphCache
 from dnerf.limits import Limits
@@ -212,6 +213,9 @@ class Trainer:
         if checkpoints is not None:
             run.data = fingerprint(frames)
         renderer.train()
+        for part in renderer.modules():
+            if isinstance(part, TimeEncoding):
+                part.see(frames.times)
         places = self._places(processes)
         renderer.sampler.fix_sizes(None if places is None else int(self.marched_per_sample * places), places)
         warm_up(renderer, frames)

@@ -95,6 +95,42 @@ def test_knots_say_nothing_until_they_have_learnt() -> None:
     assert TimeEncoding(3).state_dict() == {}  # as models of before there were any
 
 
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        (torch.linspace(0, 1, 50), 25),
+        (torch.linspace(0, 1, 400), 100),  # all there are
+        (torch.linspace(0, 1, 7).repeat(20), 7),  # moments that twenty cameras see
+        (torch.zeros(30), 2),
+        (torch.zeros(1), 2),
+    ],
+)
+def test_half_as_many_knots_as_frames_are_used(times: torch.Tensor, expected: int) -> None:
+    encoding = with_knots(100)
+    encoding.see(times)
+    assert encoding.num_used.item() == expected
+    assert encoding.knots is not None
+    few = with_knots(expected)
+    assert few.knots is not None
+    with torch.no_grad():
+        few.knots.copy_(encoding.knots[:expected])
+    moments = torch.linspace(-0.1, 1.1, 200, dtype=torch.float64)[:, None]
+    torch.testing.assert_close(encoding(moments), few(moments), rtol=0, atol=1e-12)
+    torch.testing.assert_close(encoding.roughness(), few.roughness())
+    (encoding(moments).sum() + encoding.roughness()).backward()
+    assert encoding.knots.grad is not None
+    assert torch.count_nonzero(encoding.knots.grad[expected:]) == 0
+    again = with_knots(100)
+    again.load_state_dict(encoding.state_dict())
+    assert torch.equal(again(moments), encoding(moments))
+
+
+def test_without_knots_there_is_nothing_to_tell() -> None:
+    encoding = TimeEncoding(3)
+    encoding.see(torch.linspace(0, 1, 50))
+    assert encoding.state_dict() == {}
+
+
 @pytest.mark.parametrize("shape", [(0, 1), (3, 0, 1), (1,), (2, 3, 1)])
 def test_times_of_any_number_are_encoded(shape: tuple[int, ...]) -> None:
     assert with_knots()(torch.rand(shape, dtype=torch.float64)).shape == (*shape[:-1], 9)

@@ -52,6 +52,14 @@ def test_loss_falls(frames):
     assert last < 0.6 * first
 
 
+def test_deformations_learn_of_half_as_many_moments_as_there_are_frames(frames):
+    knots = DisplacementDeformation(1, 8, (), time_knots=100)
+    renderer = Renderer(DeformedField(knots, NeRFField(1, 8, ())), StratifiedSampler(4, BOX), RandomBackground())
+    trainer(num_steps=1).fit(renderer, frames)
+    assert knots.encode_times.num_used == 4
+    assert knots.encode_times.knots.shape == (100, 4)
+
+
 def test_a_time_window_begins_with_few_frames(frames):
     class Watched(TimeWindow):
         def num_frames(self, count, progress):

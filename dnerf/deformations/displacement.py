@@ -26,7 +26,7 @@ class DisplacementDeformation(Deformation):
         time_frequencies: octaves of the times' encoding.
         canonical_time: t0 in [0, 1], or None.
         window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
-        time_knots: moments of which features are learnt, see `TimeEncoding`; 0 for none.
+        time_knots: moments of which features are learnt, half as many as frames at most (`TimeEncoding`); 0 for none.
         knot_features: how many of each.
 
     Raises:

@@ -31,7 +31,7 @@ class NetworkVelocity(Velocity):
         smoothness: see `BoxWindow`.
         window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
         twists: k in radians per unit of the MLP's output; 0 for a field that gives v itself.
-        time_knots: moments of which features are learnt, see `TimeEncoding`; 0 for none.
+        time_knots: moments of which features are learnt, half as many as frames at most (`TimeEncoding`); 0 for none.
         knot_features: how many of each.
 
     Raises:
