@@ -106,14 +106,20 @@ class TimeEncoding(nn.Module):
 
     @torch.no_grad()
     def see(self, times: Tensor) -> None:
-        """Use half as many knots as there are frames, and at most one for each moment.
+        """Use half as many knots as there are frames, and at most one for each moment; what they know stays.
 
         Args:
             times: (F,) of the frames that training has.
         """
-        if self.knots is not None:
-            wanted = min(len(times) // FRAMES_OF_A_KNOT, len(times.unique()))
-            self.num_used.fill_(min(max(wanted, 2), len(self.knots)))
+        if self.knots is None:
+            return
+        wanted = min(len(times) // FRAMES_OF_A_KNOT, len(times.unique()), len(self.knots))
+        wanted = max(wanted, 2)
+        if wanted != self.num_used:
+            places = torch.linspace(0, 1, wanted, dtype=self.knots.dtype, device=self.knots.device)
+            features = self._features(self.knots, places[:, None])
+            self.num_used.fill_(wanted)
+            self.knots[:wanted] = features
 
     def forward(self, times: Tensor) -> Tensor:
         """Encode times (..., 1) -> (..., 2 num_frequencies + 1 + F), in their dtype; those outside [0, 1] see its ends'

@@ -110,7 +110,7 @@ def test_half_as_many_knots_as_frames_are_used(times: torch.Tensor, expected: in
     encoding.see(times)
     assert encoding.num_used.item() == expected
     assert encoding.knots is not None
-    few = with_knots(expected)
+    few = TimeEncoding(3, expected, 2).double()
     assert few.knots is not None
     with torch.no_grad():
         few.knots.copy_(encoding.knots[:expected])
@@ -123,6 +123,16 @@ def test_half_as_many_knots_as_frames_are_used(times: torch.Tensor, expected: in
     again = with_knots(100)
     again.load_state_dict(encoding.state_dict())
     assert torch.equal(again(moments), encoding(moments))
+
+
+def test_what_knots_know_stays_when_there_are_more_frames() -> None:
+    encoding, moments = with_knots(100), torch.linspace(-0.1, 1.1, 200, dtype=torch.float64)[:, None]
+    encoding.see(torch.linspace(0, 1, 50))
+    before = encoding(moments)
+    encoding.see(torch.linspace(0, 1, 98))  # 49 knots, every second where one was
+    torch.testing.assert_close(encoding(moments), before, rtol=0, atol=1e-12)
+    encoding.see(torch.linspace(0, 1, 50))
+    torch.testing.assert_close(encoding(moments), before, rtol=0, atol=1e-12)
 
 
 def test_without_knots_there_is_nothing_to_tell() -> None:
