@@ -72,7 +72,9 @@ def load_blender(
     size, has_alpha = _common_header(manifest)
     width = size[0] if resolution is None else int(resolution)
     if width > size[0]:
-        raise ValueError(f"resolution must be at most the images' width {size[0]} in {root}, got {resolution}")
+        raise ValueError(
+            f"resolution must be at most the images' width {size[0]} in {root}, or null for that, got {resolution}"
+        )
     height = max(1, round(size[1] * width / size[0]))
     channels = 4 if has_alpha else 3
     num_bytes = len(manifest.images) * height * width * channels
