@@ -159,6 +159,15 @@ def test_every_part_of_the_needs_can_be_removed_by_its_overrides():
             assert compose("train", last_of_each([*base, *overrides])) != full, name
 
 
+def test_all_parts_of_the_needs_can_be_removed_together():
+    conf = Path(__file__).parents[2] / "conf"
+    section = OmegaConf.load(conf / "benchmark.yaml").needs
+    assert {name for names in section.includes.values() for name in names} <= set(section.parts)
+    overrides = removing(list(section.parts), section.parts, section.includes)
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        compose("train", last_of_each([f"experiment={section.experiment}", *section.full, *overrides]))
+
+
 def test_scenes_are_exact_ones_or_folders(tmp_path):
     assert scene_overrides("walker", 80, None) == ["data=synthetic", "scene=walker", "data.resolution=80"]
     (tmp_path / "lego").mkdir()
