@@ -24,6 +24,7 @@ from dnerf.fields import DeformedField, SpaceTimeVolumes
 from dnerf.motion import carry
 from dnerf.optimizers import AdamMuon
 from dnerf.renderer import Renderer
+from dnerf.seen_matter import SeenMatter, seen_matter
 
 Contents = Callable[[Tensor, Tensor], Tensor]
 """What a field holds, (M, 4), at positions (M, 3) and times (M,)."""
@@ -31,7 +32,7 @@ Contents = Callable[[Tensor, Tensor], Tensor]
 Carried = Callable[[Tensor, Tensor, Tensor, float], Tensor]
 """Where positions (M, 3) at times (M,) are at other times (M,), so far apart at most."""
 
-CHUNK = 16384  # rays, and points, at a time
+CHUNK = 16384  # points that are judged
 LOOKING = (0.0, 0.0, 1.0)
 """Direction in which contents are looked at: one for all, so that highlights stay where they are."""
 
@@ -58,19 +59,6 @@ class FoundMotion:
     def is_motion(self) -> bool:
         """Whether the flow's tracks are the better ones; not if they are not finite."""
         return self.carried < MOST_LEFT * self.deformed
-
-
-@dataclass(frozen=True)
-class SeenMatter:
-    """Matter that pictures show.
-
-    Args:
-        positions: (N, 3) in world units.
-        times: (N,) in [0, 1].
-    """
-
-    positions: Tensor
-    times: Tensor
 
 
 def has_unknown_motion(renderer: Renderer) -> bool:
@@ -173,7 +161,7 @@ class MotionSearch:
         contents = partial(self._contents, renderer)
         at_rest = {name: value.clone() for name, value in flow.state_dict().items()}
         with _learning_only(flow, renderer):
-            seen = self._seen_matter(renderer, frames.to(renderer.device), generator)
+            seen = seen_matter(renderer, frames.to(renderer.device), self.num_rays, generator)
             if not len(seen.times):
                 return None
             carried = partial(self._carried, flow, field.bodies)
@@ -183,22 +171,6 @@ class MotionSearch:
         if not found.is_motion:
             flow.load_state_dict(at_rest)
         return found
-
-    @torch.no_grad()
-    def _seen_matter(self, renderer: Renderer, frames: Frames, generator: torch.Generator) -> SeenMatter:
-        """Samples of random rays, each kept with the chance of its share in the picture."""
-        device = renderer.device
-        indices = torch.randint(frames.num_pixels, (self.num_rays,), generator=generator, device=device)
-        positions, times = [], []
-        for part in indices.split(CHUNK):
-            rendering = renderer(frames.pixels(part)[0])
-            assert rendering.output is not None
-            assert rendering.weights is not None
-            weights, extras = rendering.weights.reshape(-1), rendering.output.extras
-            kept = torch.rand(weights.shape, generator=generator, device=device) < weights
-            positions.append(extras["positions"].reshape(-1, 3)[kept])
-            times.append(extras["times"].reshape(-1)[kept])
-        return SeenMatter(torch.cat(positions), torch.cat(times))
 
     def _fit(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from hydra_app import build, load_config, load_renderer, resolve_device, run_app
 from omegaconf import DictConfig
+from torch import Tensor
 from tqdm import tqdm
 
 from dnerf.benchmarks.endpoint_rows import endpoint_rows
@@ -19,10 +20,12 @@ from dnerf.data import SyntheticData
 from dnerf.deformations import Deformation
 from dnerf.deformations.folding import folding
 from dnerf.evaluation import spread_indices
+from dnerf.fields import DeformedField
 from dnerf.files import write_json
-from dnerf.motion import Trajectories, motion_model
+from dnerf.motion import motion_model
 from dnerf.motion_search import has_unknown_motion
 from dnerf.renderer import Renderer
+from dnerf.seen_matter import seen_matter
 from dnerf.tracks import render_tracks, seen_points
 from dnerf.video import FORMATS, write_frames, write_png
 
@@ -34,7 +37,8 @@ def main(config: DictConfig) -> None:
     """Load the run, choose and follow points, draw, and measure where the truth is known."""
     for name in ("num_frames", "fps", "spacing", "every"):
         check_positive(name, config[name])
-    check_positive("trail", config.trail, allow_zero=True)
+    for name in ("trail", "matter_rays"):
+        check_positive(name, config[name], allow_zero=True)
     check_choice("format", config.format, FORMATS)
     if not 0 <= config.start <= 1:
         raise ValueError(f"start must be in [0, 1], got {config.start}")
@@ -66,17 +70,24 @@ def main(config: DictConfig) -> None:
         print("note: this model shows matter whose motion it does not know, see motion_search in docs/flow.md")
     model = motion_model(renderer)
     if isinstance(model, Deformation):
-        _print_folding(model, tracks)
+        moments = tracks.times[:, None].expand(tracks.positions.shape[:-1])
+        _print_folding(model, tracks.positions, moments, "along the tracks")
+    if isinstance(renderer.field, DeformedField) and config.matter_rays:
+        frames = data.frames("train").to(device)
+        seen = seen_matter(renderer, frames, config.matter_rays, torch.Generator(device).manual_seed(0))
+        if len(seen.times):
+            where = f"in matter of training pixels ({len(seen.times):,} places)"
+            _print_folding(renderer.field.modelled_motion, seen.positions, seen.times, where)
     if isinstance(data, SyntheticData):
         _measure(renderer, data, Path(config.run) / "motion.json", device)
 
 
-def _print_folding(deformation: Deformation, tracks: Trajectories) -> None:
-    found = folding(deformation, tracks.positions, tracks.times[:, None].expand(tracks.positions.shape[:-1]))
+def _print_folding(deformation: Deformation, positions: Tensor, times: Tensor, where: str) -> None:
+    found = folding(deformation, positions, times)
     low, high = found.stretch
     print(
-        f"smallest Jacobian determinant along the tracks: {found.least_determinant:.3f} (negative where space folds: "
-        f"{found.share_folded:.2%}); smallest singular value {low:.2f} to {high:.2f} (middle 90 %; 1 is rigid)"
+        f"smallest Jacobian determinant {where}: {found.least_determinant:.3f} (negative where space folds: "
+        f"{found.share_folded:.3%}); smallest singular value {low:.2f} to {high:.2f} (middle 90 %; 1 is rigid)"
     )
 
 

@@ -9,6 +9,7 @@ from dnerf.deformations.base import Deformation, check_positions_times
 from dnerf.deformations.fixed_point import jacobians
 
 MIDDLE = (0.05, 0.95)
+CHUNK = 1 << 15  # places whose derivatives are in memory at a time
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,8 @@ def folding(deformation: Deformation, positions: Tensor, times: Tensor) -> Foldi
     check_positions_times(positions, times)
     if not positions.numel():
         raise ValueError("positions must be at least one, got none")
-    found = jacobians(deformation, positions.reshape(-1, 3), times.reshape(-1))
+    parts = zip(positions.reshape(-1, 3).split(CHUNK), times.reshape(-1).split(CHUNK), strict=True)
+    found = torch.cat([jacobians(deformation, *part) for part in parts])
     determinants, smallest = torch.linalg.det(found), torch.linalg.svdvals(found)[:, -1].sort().values
     low, high = (float(smallest[round(share * (len(smallest) - 1))]) for share in MIDDLE)
     return Folding(float(determinants.min()), float((determinants < 0).float().mean()), (low, high))
