@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dnerf.cameras import Camera
 from dnerf.checks import check_positive, check_shape
+from dnerf.compositing import median_depth
 from dnerf.motion import Trajectories, follow, motion_model
 from dnerf.renderer import Renderer
 from dnerf.video import to_uint8
@@ -18,19 +19,32 @@ SUPERSAMPLING = 3
 """Trails are drawn so much larger and scaled down, since Pillow's lines have no smooth edges."""
 
 
+@torch.no_grad()
 def seen_points(renderer: Renderer, camera: Camera, time: float, spacing: int, *, chunk: int = 16384) -> Tensor:
     """Points (P, 3) on the matter that every `spacing`-th pixel of every `spacing`-th row shows.
 
+    Args:
+        renderer: in evaluation mode.
+        camera: of the picture.
+        time: in [0, 1].
+        spacing: in pixels, >= 1.
+        chunk: rays rendered at a time.
+
     Raises:
-        ValueError: if the picture shows no matter there.
+        ValueError: if the picture shows no matter there, or for settings that are not positive.
     """
     check_positive("spacing", spacing)
-    rendering = renderer.render_image(camera, time, chunk=chunk)
-    rays = camera.rays(time)
-    points = torch.addcmul(rays.origins, rendering.depth.reshape(-1, 1), rays.directions)
-    points = points.reshape(*rendering.depth.shape, 3)
-    rows = slice(spacing // 2, None, spacing)
-    chosen = points[rows, rows][rendering.opacity[rows, rows] > 0.9]
+    check_positive("chunk", chunk)
+    width, height = camera.intrinsics.width, camera.intrinsics.height
+    rows, columns = (torch.arange(spacing // 2, size, spacing) for size in (height, width))
+    pixels = (width * rows[:, None] + columns).reshape(-1).to(camera.pose.device)
+    found = [camera.pose.new_zeros(0, 3)]
+    for part in pixels.split(chunk):
+        rays = camera.rays(time, part)
+        rendering = renderer(rays)
+        points = torch.addcmul(rays.origins, median_depth(rendering)[:, None], rays.directions)
+        found.append(points[rendering.opacity > 0.9])
+    chosen = torch.cat(found)
     if not len(chosen):
         raise ValueError(
             f"time {time}: the picture shows no matter at a spacing of {spacing} pixels; take a smaller one"

@@ -6,12 +6,12 @@ from dnerf.backgrounds import RandomBackground
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, GridField, SpaceTimeVolumes
 from dnerf.losses import FadingLoss, HiddenMatterLoss, Loss, PhotometricLoss
-from dnerf.motion_losses import ElasticLoss, SteadyMatterLoss, VolumeLoss
+from dnerf.motion_losses import ElasticLoss, FoldingLoss, SteadyMatterLoss, VolumeLoss
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
 
 BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
-LOSSES = ("rgb", "elastic", "volume", "steady", "hidden_matter")
+LOSSES = ("rgb", "elastic", "volume", "folding", "steady", "hidden_matter")
 
 
 def small_renderer(*, graphs: bool = False, device: str = "cpu", **sampling: object) -> Renderer:
@@ -37,5 +37,5 @@ def small_renderer(*, graphs: bool = False, device: str = "cpu", **sampling: obj
 def losses() -> dict[str, Loss]:
     """Those of the fast path and of its flow."""
     steady, hidden = SteadyMatterLoss(), HiddenMatterLoss(BOX, memory_samples=200)
-    terms = (PhotometricLoss(), ElasticLoss(), FadingLoss(VolumeLoss()), steady, hidden)
+    terms = (PhotometricLoss(), ElasticLoss(), FadingLoss(VolumeLoss()), FoldingLoss(), steady, hidden)
     return dict(zip(LOSSES, terms, strict=True))

@@ -16,6 +16,7 @@ from dnerf.compositing import (
     FieldOutput,
     Rendering,
     composite,
+    median_depth,
     render_weights,
     safe_divide,
     sum_along_rays,
@@ -450,6 +451,46 @@ def test_sums_along_rays_agree_with_a_loop(layout: str, trailing: tuple[int, ...
     else:
         result = sum_along_rays(values, dense, weights if weighted else None)
     torch.testing.assert_close(result, expected, rtol=1e-14, atol=0)
+
+
+@both_layouts
+@pytest.mark.parametrize("num_samples", [16, 64, 256])
+def test_half_of_the_light_is_lost_where_the_closed_form_says(layout: str, num_samples: int) -> None:
+    """In constant density on (1, 5): 1 + log(2 / (1 + exp(-4 sigma))) / sigma, up to a sample's length squared."""
+    density = torch.tensor([[0.01], [0.5], [2.0]], dtype=torch.float64)
+    samples = uniform(1, 5, num_samples, num_rays=3)
+    found = median_depth(render(layout, samples, density.expand(3, num_samples)))
+    expected = 1 + torch.log(2 / (1 + torch.exp(-4 * density))) / density
+    torch.testing.assert_close(found, expected[:, 0], rtol=0, atol=(4 / num_samples) ** 2)
+
+
+@both_layouts
+def test_median_depth_at_an_edge_lies_on_one_side(layout: str) -> None:
+    """Half-covered by a wall at 1 before one at 3: the expected depth is between, the median where more light is."""
+    samples = uniform(0, 4, 40, num_rays=2)
+    density = torch.zeros(2, 40, dtype=torch.float64)
+    density[:, 10] = torch.tensor([10 * math.log(1 / 0.4), 10 * math.log(1 / 0.6)])  # absorbs 0.6 and 0.4
+    density[:, 30] = 1e4
+    rendering = render(layout, samples, density)
+    assert ((rendering.depth > 1.2) & (rendering.depth < 2.9)).all()
+    near, far = median_depth(rendering).tolist()
+    assert 1.0 < near < 1.1
+    assert 3.0 < far < 3.1
+
+
+@both_layouts
+def test_median_depth_of_vacuum_is_zero(layout: str) -> None:
+    density = torch.zeros(3, 8, dtype=torch.float64)
+    density[1, 4] = 1e-9
+    found = median_depth(render(layout, uniform(1, 3, 8, num_rays=3), density))
+    assert found.tolist() == pytest.approx([0.0, 2.125, 0.0], abs=1e-9)
+    nothing = Samples(*(torch.zeros(0) for _ in range(2)), 2, ray_indices=torch.zeros(0, dtype=torch.int64))
+    assert median_depth(composite(nothing, FieldOutput(torch.zeros(0), torch.zeros(0, 3)))).tolist() == [0.0, 0.0]
+
+
+def test_median_depth_of_a_whole_image_is_refused() -> None:
+    with pytest.raises(ValueError, match="rendering must have per-sample data"):
+        median_depth(Rendering(rgb=torch.zeros(2, 3), opacity=torch.zeros(2), depth=torch.zeros(2)))
 
 
 def test_safe_division_by_zero_is_zero_with_zero_gradient() -> None:

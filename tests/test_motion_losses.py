@@ -15,7 +15,7 @@ from dnerf.deformations.folding import folding
 from dnerf.deformations.velocities import NetworkVelocity, Velocity
 from dnerf.fields import DeformedField, GridField, RadianceField
 from dnerf.flow_losses import AccelerationLoss, CycleConsistencyLoss, DivergenceLoss, SmoothVelocityLoss
-from dnerf.motion_losses import ElasticLoss, SteadyMatterLoss, VolumeLoss, spread_directions
+from dnerf.motion_losses import ElasticLoss, FoldingLoss, SteadyMatterLoss, VolumeLoss, spread_directions
 from dnerf.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
@@ -23,13 +23,16 @@ from dnerf.scenes import make_scene
 LOSSES = {
     "elastic": ElasticLoss,
     "volume": VolumeLoss,
+    "folding": FoldingLoss,
     "smooth": SmoothVelocityLoss,
     "divergence": DivergenceLoss,
     "acceleration": AccelerationLoss,
     "cycle": CycleConsistencyLoss,
 }
 every_loss = pytest.mark.parametrize("name", LOSSES)
-every_loss_of_flows = pytest.mark.parametrize("name", [name for name in LOSSES if name not in ("elastic", "volume")])
+every_loss_of_flows = pytest.mark.parametrize(
+    "name", [name for name in LOSSES if name not in ("elastic", "volume", "folding")]
+)
 
 
 def renderer_of(velocity: Velocity, **settings: object) -> Renderer:
@@ -152,9 +155,9 @@ def test_gradient_is_finite_where_all_is_collapsed() -> None:
     assert torch.isfinite(deformation.matrix.grad).all()
 
 
-def volume(matrix: Tensor, **settings: float) -> Tensor:
+def volume(matrix: Tensor, kind: type[VolumeLoss] = VolumeLoss, **settings: float) -> Tensor:
     renderer = Renderer(DeformedField(Linear(matrix), make_scene("static")), StratifiedSampler(4))
-    return VolumeLoss(1.0, **settings)(rendering(), torch.zeros(8, 3), renderer)
+    return kind(1.0, **settings)(rendering(), torch.zeros(8, 3), renderer)
 
 
 def test_what_keeps_volumes_costs_nothing() -> None:
@@ -174,17 +177,28 @@ def test_volumes_cost_the_square_of_their_logarithm_and_go_on_straight(entries: 
     assert volume(matrix, least=least).item() == pytest.approx(expected**2, rel=1e-6, abs=1e-9)
 
 
-@pytest.mark.parametrize("thickness", [0.5, 0.05, 0.0, -1.0])
-def test_lost_volume_is_pulled_back(thickness: float) -> None:
+@given(st.lists(st.floats(-2, 2), min_size=9, max_size=9), st.sampled_from([0.1, 0.4, 1.0]))
+def test_folding_costs_what_lacks_to_the_limit_and_nothing_beyond(entries: list[float], limit: float) -> None:
+    matrix = torch.tensor(entries, dtype=torch.float64).reshape(3, 3)
+    determinant = float(torch.linalg.det(matrix))
+    logarithm = math.log(determinant) if determinant > 0.1 else math.log(0.1) + (determinant - 0.1) / 0.1
+    expected = min(0.0, logarithm - math.log(limit)) ** 2
+    assert volume(matrix, FoldingLoss, limit=limit).item() == pytest.approx(expected, rel=1e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", [VolumeLoss, FoldingLoss])
+@pytest.mark.parametrize("thickness", [0.4, 0.05, 0.0, -1.0])
+def test_lost_volume_is_pulled_back(thickness: float, kind: type[VolumeLoss]) -> None:
     deformation = Linear(torch.diag(torch.tensor([1.0, 1.0, thickness])))
     renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
-    VolumeLoss(1.0)(rendering(dtype=torch.float32), torch.zeros(8, 3), renderer).backward()
+    kind(1.0)(rendering(dtype=torch.float32), torch.zeros(8, 3), renderer).backward()
     assert torch.isfinite(deformation.matrix.grad).all()
     assert deformation.matrix.grad[2, 2] < -1
 
 
+@pytest.mark.parametrize("kind", [VolumeLoss, FoldingLoss])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_what_keeps_volumes_unfolds(seed: int) -> None:
+def test_what_folds_is_unfolded(seed: int, kind: type[VolumeLoss]) -> None:
     """A displacement too sharp folds space; minimising the loss alone leaves none that does, and some motion."""
     torch.manual_seed(seed)
     deformation = DisplacementDeformation(2, 32, (), position_frequencies=2, time_frequencies=2, canonical_time=None)
@@ -197,7 +211,7 @@ def test_what_keeps_volumes_unfolds(seed: int) -> None:
     optimizer = torch.optim.Adam(deformation.parameters(), 3e-3)
     for _ in range(200):
         optimizer.zero_grad()
-        VolumeLoss(1.0, 500)(picture, torch.zeros(8, 3), renderer).backward()
+        kind(1.0, 500)(picture, torch.zeros(8, 3), renderer).backward()
         optimizer.step()
     assert folding(deformation, *places).least_determinant > 0.1
     assert (deformation(*places) - places[0]).norm(dim=-1).mean() > 0.1
@@ -371,6 +385,9 @@ def test_a_field_without_deformation_is_named() -> None:
         (lambda: ElasticLoss(distance=0.0), "distance must be > 0"),
         (lambda: VolumeLoss(distance=0.0), "distance must be > 0"),
         (lambda: VolumeLoss(least=-1.0), "least must be > 0"),
+        (lambda: FoldingLoss(distance=-0.1), "distance must be > 0"),
+        (lambda: FoldingLoss(limit=1.5), r"limit must be in \[least, 1\] = \[0.1, 1\], got 1.5"),
+        (lambda: FoldingLoss(limit=0.05), r"limit must be in \[least, 1\] = \[0.1, 1\], got 0.05"),
         (lambda: SteadyMatterLoss(length=0.0), "length must be > 0"),
         (lambda: SmoothVelocityLoss(-1.0), "weight must be >= 0"),
         (lambda: DivergenceLoss(1.0, 0), "num_points must be > 0"),

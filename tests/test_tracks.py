@@ -43,10 +43,8 @@ def test_hidden_points_are_left_out() -> None:
 def test_seen_points_lie_on_matter(renderer: Renderer) -> None:
     points = seen_points(renderer, CAMERA, 0.0, 5)
     assert len(points) > 5
-    inward = points + 0.05 * torch.nn.functional.normalize(points - CAMERA.pose[:3, 3], dim=-1)
-    inside = renderer.field.contains(inward, torch.zeros(len(points))).any(-1)
-    # Expected depth at silhouettes may fall beside a thin edge.
-    assert inside.float().mean() > 0.9
+    inward = points + 0.02 * torch.nn.functional.normalize(points - CAMERA.pose[:3, 3], dim=-1)
+    assert renderer.field.contains(inward, torch.zeros(len(points))).any(-1).all()
 
 
 def test_tracks_are_those_of_the_scene(renderer: Renderer) -> None:
