@@ -49,6 +49,7 @@ FLOORS = {
     "protocols": 6,
     "records": 6,
     "recovery": 6,
+    "seen_matter": 6,
     "time_window": 6,
     "visualisation": 6,
     # 7: whole runs.
