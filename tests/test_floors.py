@@ -49,7 +49,6 @@ FLOORS = {
     "protocols": 6,
     "records": 6,
     "recovery": 6,
-    "seen_matter": 6,
     "time_window": 6,
     "visualisation": 6,
     # 7: whole runs.
@@ -64,6 +63,7 @@ FLOORS = {
     "motion_search": 7,
     "report": 7,
     "run_state": 7,
+    "seen_matter": 7,
     "sequences": 7,
     "sightings": 7,
     "steps": 7,
@@ -91,6 +91,7 @@ WITHIN_A_FLOOR = {
     ("logs", "video"),
     ("mlp", "kernels"),
     ("motion_losses", "losses"),
+    ("motion_search", "seen_matter"),
     ("tracks", "video"),
     ("rays", "checks"),
     ("rays", "fixed_size"),
