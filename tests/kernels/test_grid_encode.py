@@ -121,6 +121,27 @@ def test_compiled_agrees_with_reference(compiled, dtype, num_samples):
     torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.parametrize("num_samples", [255, 256, 257, 700])  # of which 256 are located at once
+def test_numba_agrees_with_reference_in_blocks_of_places(num_samples):
+    levels = GridLevels((3, 40, (3000, 70000, 100000)), max_rows=256)  # products with the hash's primes wrap around
+    positions, table = example(num_samples, levels)
+    grad = torch.randn(num_samples, 9, dtype=torch.float64)
+    with kernels.use_backend("reference"):
+        expected = values_and_gradients(positions, table, levels, grad)
+    with kernels.use_backend("numba"):
+        actual = values_and_gradients(positions, table, levels, grad)
+    torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_vertices_show_their_row_to_the_last_bit(compiled, dtype):
+    levels = GridLevels((4,), max_rows=256)
+    z, y, x = torch.meshgrid(*[torch.linspace(0, 1, 5, dtype=dtype)] * 3, indexing="ij")
+    table = 10.0 ** torch.linspace(-8, 8, levels.num_rows, dtype=dtype)[:, None]
+    vertices = torch.stack([x, y, z], -1).reshape(-1, 3)
+    assert torch.equal(grid_encode(vertices.to(compiled), table.to(compiled), levels).cpu(), table)
+
+
 def test_gradcheck(compiled):
     levels = GridLevels((1, 2), 8)
     positions, table = example(2, levels, 1)
@@ -186,6 +207,7 @@ def test_table_gradient_does_not_depend_on_threads():
 
 def test_table_gradient_split_into_row_blocks_is_the_same():
     from dnerf.kernels.cpu import grid_encode as cpu
+    from dnerf.kernels.cpu.cells import cell_tables
     from dnerf.kernels.cpu.tasks import none_taken
 
     positions, table = (x.numpy() for x in example(500))
@@ -195,8 +217,9 @@ def test_table_gradient_split_into_row_blocks_is_the_same():
         torch.zeros(table.shape, dtype=torch.float64),
         torch.zeros(table.shape, dtype=torch.float64),
     )
-    cpu._grad_table(grad, positions, levels, 0, whole.numpy(), 2, none_taken(), (0,) * 3)
-    cpu._grad_table(grad, positions, levels, 2, parts.numpy(), 5, none_taken(), (0,) * 3)
+    for part_bits, workers, out in ((0, 2, whole), (2, 5, parts)):
+        tables = cell_tables(positions.dtype, workers)
+        cpu._grad_table(grad, positions, levels, part_bits, out.numpy(), tables, workers, none_taken(), (0,) * 3)
     assert torch.equal(whole, parts)
 
 

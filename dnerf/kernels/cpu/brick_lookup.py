@@ -13,6 +13,8 @@ from .launch import BORROWS, FAST, kernel, launch
 from .rows import blend_rows
 
 SIDE = BRICK + 1
+# Rows of a cell's eight vertices, from that of the lowest; bit 0 of the vertex number is z, bit 2 x.
+CORNERS = tuple((k >> 2) * SIDE * SIDE + (k >> 1 & 1) * SIDE + (k & 1) for k in range(8))
 
 
 def brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tensor, Tensor]:
@@ -52,22 +54,6 @@ def first_row(x: int, y: int, z: int, number: int) -> Any:
     return np.int64(number * VERTICES + (x * SIDE + y) * SIDE + z)
 
 
-@njit(fastmath=FAST, **BORROWS)
-def corner_rows(a: int) -> Any:
-    """Rows of the eight vertices of a cell, from that of the lowest; bit 0 of the vertex number is z, bit 2 x."""
-    b, c = a + SIDE, a + SIDE * SIDE
-    d = c + SIDE
-    return a, a + 1, b, b + 1, c, c + 1, d, d + 1
-
-
-@njit(fastmath=FAST, **BORROWS)
-def corner_weights(u: Any, v: Any, w: Any) -> Any:
-    """Trilinear weights of the eight vertices, in the order of `corner_rows`, at fractions of the cell."""
-    one = type(u)(1)
-    e, f, g, h = (one - u) * (one - v), (one - u) * v, u * (one - v), u * v
-    return e * (one - w), e * w, f * (one - w), f * w, g * (one - w), g * w, h * (one - w), h * w
-
-
 @kernel(fastmath=FAST, **BORROWS)
 def _lookup(positions: Any, slots: Any, table: Any, values: Any, known: Any, lanes: Any) -> None:
     for i in prange(positions.shape[0]):
@@ -78,5 +64,6 @@ def _lookup(positions: Any, slots: Any, table: Any, values: Any, known: Any, lan
             if number >= 0:
                 known[i] = True
                 real = positions.dtype.type
-                weights = corner_weights(px - real(x), py - real(y), pz - real(z))
-                blend_rows(table, corner_rows(first_row(x, y, z, number)), weights, values, i * len(lanes), lanes)
+                fractions = pz - real(z), py - real(y), px - real(x)
+                row = first_row(x, y, z, number)
+                blend_rows(table, row, CORNERS, fractions, values, i * len(lanes), lanes)

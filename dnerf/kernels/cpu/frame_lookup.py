@@ -9,9 +9,9 @@ from numba import njit
 
 from ..brick_lookup import BRICK_BITS
 from ..trace import ELSEWHERE, LACKS_BRICK, LACKS_VERTEX, MOST_LOG_DENSITY
-from .brick_lookup import SIDE, cell_of, corner_rows, corner_weights, first_row, is_inside
+from .brick_lookup import CORNERS, SIDE, cell_of, first_row, is_inside
+from .cells import locate
 from .exponential import exp, expm1
-from .grid_encode import locate, trilinear_weights
 from .launch import BORROWS, FAST
 from .rows import blend_rows, prefetch_row
 
@@ -70,12 +70,10 @@ def brick_at(middle: Any, course: Any, lattice: Any, contents: Any, moved: Any) 
 def blend_vertices(displacements: Any, shape: Any, cell: Any, fractions: Any, moved: Any, lanes: Any) -> None:
     """Interpolate in a cell of a lattice of (z, y, x) vertices; `moved` gets the row."""
     x, y, z = cell
-    u, v, w = fractions
     _, ly, lx = shape
-    a = np.int64(x + lx * (y + ly * z))
-    b, c = a + lx, a + lx * ly
-    d = c + lx
-    blend_rows(displacements, (a, a + 1, b, b + 1, c, c + 1, d, d + 1), trilinear_weights(u, v, w), moved, 0, lanes)
+    c = lx * ly
+    corners = 0, 1, lx, lx + 1, c, c + 1, c + lx, c + lx + 1
+    blend_rows(displacements, np.int64(x + lx * (y + ly * z)), corners, fractions, moved, 0, lanes)
 
 
 @njit(forceinline=True, **BORROWS)
@@ -99,8 +97,8 @@ def log_density_at(found: Any, i: int, lattice: Any, contents: Any, values: Any,
     """Look up the contents at a place that was found; the logarithm of their density."""
     rows, fractions = found
     bricks, waves, log_shift = contents[1], contents[4], contents[5]
-    weights = corner_weights(fractions[i, 0], fractions[i, 1], fractions[i, 2])
-    blend_rows(bricks, corner_rows(rows[i]), weights, values, 0, lanes)
+    places = fractions[i, 2], fractions[i, 1], fractions[i, 0]
+    blend_rows(bricks, rows[i], CORNERS, places, values, 0, lanes)
     raw, most = log_shift + sum_of_terms(values, 0, waves) + added(found, i, 0, lattice), np.float32(MOST_LOG_DENSITY)
     return most if raw > most else raw
 

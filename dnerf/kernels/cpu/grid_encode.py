@@ -6,18 +6,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from ..grid_encode import GridLevels
+from .cells import PLACES, cell_tables, fractions_at, locate_all, rows_at, take_places, trilinear_weights
 from .launch import BORROWS, FAST, kernel, launch, num_threads
 from .rows import add_to_row, blend_rows, dot_slopes
 from .tasks import next_task, none_taken
 
-PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
 # A table gradient's rows are dealt out in blocks of 2^6: fine enough to balance crowded regions of a dense level.
 ROW_BLOCK_BITS = 6
-SAMPLES_AT_ONCE = 256  # dealt out to threads
 
 
 def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
@@ -34,43 +33,31 @@ def forward_rounded(positions: Tensor, table: Tensor, cells: list[int], max_rows
 
 
 def _launch_forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int, out: np.ndarray) -> None:
-    launch(
-        _forward,
-        _array(positions),
-        _array(table),
-        _levels(tuple(cells), max_rows),
-        out,
-        num_threads(),
-        none_taken(),
-        (0,) * table.shape[1],
-    )
+    levels, lanes = _levels(tuple(cells), max_rows), (0,) * table.shape[1]
+    launch(_forward, _array(positions), _array(table), levels, out, *_workers(positions), lanes)
 
 
 def grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    levels = _levels(tuple(cells), max_rows)
+    levels, lanes = _levels(tuple(cells), max_rows), (0,) * table.shape[1]
     out = torch.zeros_like(table, memory_format=torch.contiguous_format)
-    lanes = (0,) * table.shape[1]
     part_bits = max(0, (num_threads() - 1) // len(levels)).bit_length()
-    launch(
-        _grad_table, _array(grad), _array(positions), levels, part_bits, out.numpy(), num_threads(), none_taken(), lanes
-    )
+    arrays = _array(grad), _array(positions)
+    launch(_grad_table, *arrays, levels, part_bits, out.numpy(), *_workers(positions), lanes)
     return out
 
 
 def grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
+    levels, lanes = _levels(tuple(cells), max_rows), (0,) * table.shape[1]
     out = torch.empty_like(positions, memory_format=torch.contiguous_format)
-    launch(
-        _grad_positions,
-        _array(grad),
-        _array(positions),
-        _array(table),
-        _levels(tuple(cells), max_rows),
-        out.numpy(),
-        num_threads(),
-        none_taken(),
-        (0,) * table.shape[1],
-    )
+    arrays = _array(grad), _array(positions), _array(table)
+    launch(_grad_positions, *arrays, levels, out.numpy(), *_workers(positions), lanes)
     return out
+
+
+def _workers(positions: Tensor) -> tuple[Any, int, np.ndarray]:
+    """Tables for as many workers as there are threads, their number, and the counter of the tasks they take."""
+    threads = num_threads()
+    return cell_tables(positions.detach().numpy().dtype, threads), threads, none_taken()
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -83,68 +70,36 @@ def _levels(cells: tuple[int, ...], max_rows: int) -> np.ndarray:
     return np.array(GridLevels(triples, max_rows).describe(), dtype=np.int64)
 
 
-@njit(fastmath=FAST, **BORROWS)
-def locate(position: Any, num_cells: int) -> Any:
-    """Lower vertex and fraction along one axis. A NaN gives vertex 0 and fraction NaN, never a wild index."""
-    one = type(position)(1)
-    zero = type(position)(0)
-    clamped = zero if position < zero else (one if position > one else position)
-    scaled = clamped * type(position)(num_cells)
-    lower = min(np.int64(scaled), num_cells - 1) if scaled >= zero else 0
-    return lower, scaled - type(position)(lower)
-
-
-@njit(fastmath=FAST, **BORROWS)
-def _rows(x: int, y: int, z: int, level: Any) -> Any:
-    """Table rows of the 8 vertices of a cell; bit 0 of the vertex number is x, bit 1 y, bit 2 z."""
-    offset, mask = level[3], level[4]
-    if mask < 0:
-        row_y = level[0] + 1
-        row_z = row_y * (level[1] + 1)
-        a = offset + x + y * row_y + z * row_z
-        b, c, d = a + row_y, a + row_z, a + row_y + row_z
-        return a, a + 1, b, b + 1, c, c + 1, d, d + 1
-    y0, z0 = y * PRIME_Y, z * PRIME_Z
-    y1, z1 = y0 + PRIME_Y, z0 + PRIME_Z
-    return (
-        offset + ((x ^ y0 ^ z0) & mask),
-        offset + ((x + 1 ^ y0 ^ z0) & mask),
-        offset + ((x ^ y1 ^ z0) & mask),
-        offset + ((x + 1 ^ y1 ^ z0) & mask),
-        offset + ((x ^ y0 ^ z1) & mask),
-        offset + ((x + 1 ^ y0 ^ z1) & mask),
-        offset + ((x ^ y1 ^ z1) & mask),
-        offset + ((x + 1 ^ y1 ^ z1) & mask),
-    )
-
-
-@njit(fastmath=FAST, **BORROWS)
-def trilinear_weights(u: Any, v: Any, w: Any) -> Any:
-    """Trilinear weights of the 8 vertices, in the order of `_rows`."""
-    one = type(u)(1)
-    a, b, c, d = (one - v) * (one - w), v * (one - w), (one - v) * w, v * w
-    return (one - u) * a, u * a, (one - u) * b, u * b, (one - u) * c, u * c, (one - u) * d, u * d
-
-
 @kernel(fastmath=FAST, **BORROWS)
-def _forward(positions: Any, table: Any, levels: Any, out: Any, num_workers: int, taken: Any, lanes: Any) -> None:
-    for _ in prange(num_workers):
-        first = next_task(taken) * SAMPLES_AT_ONCE
+def _forward(
+    positions: Any, table: Any, levels: Any, out: Any, tables: Any, num_workers: int, taken: Any, lanes: Any
+) -> None:
+    for worker in prange(num_workers):
+        places, fractions, rows = tables[0][worker], tables[1][worker], tables[2][worker]
+        first = next_task(taken) * PLACES
         while first < positions.shape[0]:
-            for i in range(first, min(first + SAMPLES_AT_ONCE, positions.shape[0])):
-                for j in range(levels.shape[0]):
-                    level = levels[j]
-                    x, u = locate(positions[i, 0], level[0])
-                    y, v = locate(positions[i, 1], level[1])
-                    z, w = locate(positions[i, 2], level[2])
-                    start = i * out.shape[1] + j * len(lanes)
-                    blend_rows(table, _rows(x, y, z, level), trilinear_weights(u, v, w), out, start, lanes)
-            first = next_task(taken) * SAMPLES_AT_ONCE
+            count = take_places(positions, first, places)
+            for j in range(levels.shape[0]):
+                level = levels[j]
+                locate_all(places, count, level, rows, fractions)
+                start = first * out.shape[1] + j * len(lanes)
+                for i in range(count):
+                    blend_rows(table, level[3], rows_at(rows, i), fractions_at(fractions, i), out, start, lanes)
+                    start += out.shape[1]
+            first = next_task(taken) * PLACES
 
 
 @kernel(fastmath=FAST, **BORROWS)
 def _grad_table(
-    grad: Any, positions: Any, levels: Any, part_bits: int, out: Any, num_workers: int, taken: Any, lanes: Any
+    grad: Any,
+    positions: Any,
+    levels: Any,
+    part_bits: int,
+    out: Any,
+    tables: Any,
+    num_workers: int,
+    taken: Any,
+    lanes: Any,
 ) -> None:
     """Scatter-add without atomics: a task owns one level, or every 2^part_bits-th block of its rows.
 
@@ -153,46 +108,52 @@ def _grad_table(
     """
     num_tasks = levels.shape[0] << part_bits
     part_mask = (1 << part_bits) - 1
-    for _ in prange(num_workers):
+    for worker in prange(num_workers):
+        places, fractions, rows = tables[0][worker], tables[1][worker], tables[2][worker]
         task = num_tasks - 1 - next_task(taken)
         while task >= 0:
             level = levels[task >> part_bits]
             part = task & part_mask
-            for i in range(positions.shape[0]):
-                x, u = locate(positions[i, 0], level[0])
-                y, v = locate(positions[i, 1], level[1])
-                z, w = locate(positions[i, 2], level[2])
-                rows = _rows(x, y, z, level)
-                weights = trilinear_weights(u, v, w)
-                start = i * grad.shape[1] + (task >> part_bits) * len(lanes)
-                for k in range(8):
-                    if part_bits == 0 or (rows[k] >> ROW_BLOCK_BITS) & part_mask == part:
-                        add_to_row(out, rows[k], weights[k], grad, start, lanes)
+            for first in range(0, positions.shape[0], PLACES):
+                count = take_places(positions, first, places)
+                locate_all(places, count, level, rows, fractions)
+                start = first * grad.shape[1] + (task >> part_bits) * len(lanes)
+                for i in range(count):
+                    u, v, w = fractions_at(fractions, i)
+                    weights, corners = trilinear_weights(u, v, w), rows_at(rows, i)
+                    for k in range(8):
+                        row = level[3] + corners[k]
+                        if part_bits == 0 or (row >> ROW_BLOCK_BITS) & part_mask == part:
+                            add_to_row(out, row, weights[k], grad, start, lanes)
+                    start += grad.shape[1]
             task = num_tasks - 1 - next_task(taken)
 
 
 @kernel(fastmath=FAST, **BORROWS)
 def _grad_positions(
-    grad: Any, positions: Any, table: Any, levels: Any, out: Any, num_workers: int, taken: Any, lanes: Any
+    grad: Any, positions: Any, table: Any, levels: Any, out: Any, tables: Any, num_workers: int, taken: Any, lanes: Any
 ) -> None:
-    one, zero = positions.dtype.type(1), positions.dtype.type(0)
-    for _ in prange(num_workers):
-        first = next_task(taken) * SAMPLES_AT_ONCE
+    real = positions.dtype.type
+    for worker in prange(num_workers):
+        places, fractions, rows = tables[0][worker], tables[1][worker], tables[2][worker]
+        first = next_task(taken) * PLACES
         while first < positions.shape[0]:
-            for i in range(first, min(first + SAMPLES_AT_ONCE, positions.shape[0])):
-                grad_x, grad_y, grad_z = zero, zero, zero
-                for j in range(levels.shape[0]):
-                    level = levels[j]
-                    x, u = locate(positions[i, 0], level[0])
-                    y, v = locate(positions[i, 1], level[1])
-                    z, w = locate(positions[i, 2], level[2])
-                    rows = _rows(x, y, z, level)
-                    start = i * grad.shape[1] + j * len(lanes)
-                    along_x, along_y, along_z = dot_slopes(table, rows, (u, v, w), grad, start, lanes)
-                    grad_x += along_x * positions.dtype.type(level[0])
-                    grad_y += along_y * positions.dtype.type(level[1])
-                    grad_z += along_z * positions.dtype.type(level[2])
-                out[i, 0] = grad_x if zero <= positions[i, 0] <= one else zero
-                out[i, 1] = grad_y if zero <= positions[i, 1] <= one else zero
-                out[i, 2] = grad_z if zero <= positions[i, 2] <= one else zero
-            first = next_task(taken) * SAMPLES_AT_ONCE
+            count = take_places(positions, first, places)
+            for i in range(first, first + count):
+                out[i, 0], out[i, 1], out[i, 2] = real(0), real(0), real(0)
+            for j in range(levels.shape[0]):
+                level = levels[j]
+                locate_all(places, count, level, rows, fractions)
+                start = first * grad.shape[1] + j * len(lanes)
+                for i in range(count):
+                    along = dot_slopes(
+                        table, level[3], rows_at(rows, i), fractions_at(fractions, i), grad, start, lanes
+                    )
+                    for axis in range(3):
+                        out[first + i, axis] += along[axis] * real(level[axis])
+                    start += grad.shape[1]
+            for i in range(first, first + count):
+                for axis in range(3):
+                    if not (real(0) <= positions[i, axis] <= real(1)):
+                        out[i, axis] = real(0)
+            first = next_task(taken) * PLACES
