@@ -15,7 +15,7 @@ from dnerf.compositing import Rendering, composite, safe_divide
 from dnerf.deformations.frame_lattice import FrozenDeformation
 from dnerf.fields.base import PAD_TO, RadianceField, ask_along
 from dnerf.frame_graphs import FrameGraphs
-from dnerf.kernels import few_nonzero
+from dnerf.kernels import add_seen, few_nonzero
 from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
@@ -145,10 +145,10 @@ class Renderer(nn.Module):
                 else:
                     assert part.ray_indices is not None
                     output = ask_along(field, chosen, part.ray_indices, part.distances)
-            seen = composite(part, output)
-            columns = [seen.rgb, (seen.depth * seen.opacity)[:, None], seen.opacity[:, None]]
-            sums.index_add_(0, ray_numbers, transmittance[:, None] * torch.cat(columns, dim=-1))
-            return 1 - seen.opacity
+            return add_seen(
+                sums, ray_numbers, transmittance, part.starts, part.ends, part.offsets, output.density, output.rgb,
+                part.points,
+            )  # fmt: skip
 
         walk_front_to_back(source, numbers, self.stop_transmittance, visit)
         return self._shown(rays, sums)

@@ -38,6 +38,8 @@ def check_one_time(times: Tensor, time: float) -> None:
     Raises:
         ValueError: saying which there are.
     """
+    if times.numel() and not any(times.stride()):  # one number, expanded
+        times = times.reshape(-1)[:1]
     if times.numel() and not bool((times - time).abs().amax() < 1e-6):
         raise ValueError(f"times must all be {time}, got values from {times.min()} to {times.max()}")
 

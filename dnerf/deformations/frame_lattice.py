@@ -12,6 +12,7 @@ from dnerf.kernels import GridLevels, MarchGrid, covered_places, few_nonzero, gr
 from dnerf.rays import Rays
 
 LEAST_ROWS = 256  # fewer take matrix libraries as long
+FEW_POINTS = 1024  # whose cells' vertices are listed, not marked in the whole lattice
 MOST_AT_ONCE = 1 << 16  # vertices: bounds the memory of networks
 VERTICES_PER_RAY = 4  # most to ask around all occupied cells, instead of finding out which of them rays want
 
@@ -163,9 +164,15 @@ class FrozenDeformation(Deformation):
         size = torch.tensor(self.levels.cells, device=unit.device)
         # What is no number, or beyond those of a long, becomes the least long, and cell 0.
         x, y, z = torch.minimum((unit * size).long().clamp_(min=0), size - 1).unbind(-1)
+        _, rows, columns = self.is_known.shape
+        lowest = x.add(y.add(z, alpha=rows), alpha=columns)
+        if len(unit) <= FEW_POINTS:
+            steps = [(k & 1) + columns * ((k >> 1 & 1) + rows * (k >> 2)) for k in range(8)]
+            around = (lowest[:, None] + torch.tensor(steps, device=unit.device)).unique()
+            self.fill(around[~self.is_known.view(-1)[around]])
+            return
         needed = torch.zeros_like(self.is_known)
-        rows, columns = needed.shape[1:]
-        needed.view(-1).index_fill_(0, x.add(y.add(z, alpha=rows), alpha=columns), True)
+        needed.view(-1).index_fill_(0, lowest, True)
         for axis in range(3):
             length = needed.shape[axis] - 1
             needed.narrow(axis, 1, length).logical_or_(needed.narrow(axis, 0, length).clone())

@@ -130,7 +130,7 @@ class DeformedField(RadianceField):
         if not isinstance(deformation, FrozenDeformation) or (self.bodies is not None and self.bodies.num_bodies):
             return super().along(rays, ray_indices, distances)
         positions = deformation.along(rays, ray_indices, distances)
-        times = distances.new_full(distances.shape, deformation.time)
+        times = distances.new_tensor(deformation.time).expand(distances.shape)
         return self.canonical(positions, rays.directions.index_select(0, ray_indices), times)
 
     def _shown(self, density: Tensor, carried: Tensor) -> Tensor:

@@ -132,7 +132,7 @@ class GridField(RadianceField):
 
     def _inputs(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """What the head sees (..., n), and the scale (n,) of each column; without times, that without `space_time`."""
-        unit = (positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)
+        unit = (positions - self.low.to(positions.dtype)).mul_(self.scale.to(positions.dtype))
         features = grid_encode(unit.reshape(-1, 3), self.table, self.levels, rounded=is_bfloat16_wanted(unit))
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
         scale = None if self.window_end is None else self.window.repeat_interleave(self.table.shape[1])

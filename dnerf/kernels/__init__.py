@@ -1,5 +1,6 @@
 """The few loops where the time goes: each a plain-torch definition with compiled versions that agree with it."""
 
+from .add_seen import add_seen
 from .backend import BACKENDS, get_backend, set_backend, use_backend
 from .brick_lookup import brick_lookup
 from .covered_places import covered_places
@@ -25,6 +26,7 @@ __all__ = [
     "MarchGrid",
     "MarchedSamples",
     "SeenParts",
+    "add_seen",
     "brick_lookup",
     "covered_places",
     "few_nonzero",
