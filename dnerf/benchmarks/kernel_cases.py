@@ -16,6 +16,7 @@ from dnerf.kernels import (
     FrameTables,
     GridLevels,
     MarchedSamples,
+    add_seen,
     brick_lookup,
     covered_places,
     few_nonzero,
@@ -28,6 +29,7 @@ from dnerf.kernels import (
     packed_weights,
     relu_layers,
     seen_parts,
+    shade,
     skip_distances,
     thin_out,
     trace,
@@ -213,6 +215,13 @@ class Workload:
             seen_parts, found.starts, found.ends, found.offsets, thin, light, splits=3, split_weight=0.02,
             min_weight=4e-3,
         )  # fmt: skip
+        colors, sums, numbers = (
+            torch.rand(len(middles), 3),
+            torch.zeros(len(self.rays), 5),
+            torch.arange(len(self.rays)),
+        )
+        adding = partial(add_seen, sums, numbers, light, found.starts, found.ends, found.offsets, thin, colors)
+        products = torch.randn(self.num_samples, 4).bfloat16()
         layers = sum(x.nbytes for x in self.layers) // 2
         activations = self.num_samples * (2 * WIDTHS[0] + 2 * WIDTHS[-1])
         return [
@@ -237,6 +246,8 @@ class Workload:
             ),
             Case("lattice_places", "forward", _backends(places), (2 + 1 + 3) * n),
             Case("seen_parts", "forward", _backends(parts), 3 * n + 16 * self.num_samples),
+            Case("add_seen", "forward", _backends(adding), 6 * n + 2 * sums.nbytes),
+            Case("shade", "forward", _backends(lambda: shade(products, torch.zeros(4), -1.0)), 24 * self.num_samples),
             Case("footprints", "forward", _backends(view), occupied.nbytes + 16 * seen),
             Case("trace", "forward", _backends(self._tracer()), 10 * 4 * len(self.rays) + contents),
             *_both(

@@ -189,27 +189,31 @@ class FrozenDeformation(Deformation):
             Whether it was filled: not if that is more than `VERTICES_PER_RAY` vertices for each ray.
         """
         self.move_to(grid.occupancy.device)
-        around = self.vertices_around(grid.occupancy, grid.aabb)
+        reach = 0.5 * grid.step * (1 - 1 / grid.splits)  # of a part's middle from its interval's, which is in a cell
+        around = self.vertices_around(grid.occupancy, grid.aabb, reach)
         if len(around) > VERTICES_PER_RAY * num_rays:
             return False
         self.fill(around)
         return True
 
     @torch.no_grad()
-    def vertices_around(self, occupied: Tensor, aabb: Tensor) -> Tensor:
+    def vertices_around(self, occupied: Tensor, aabb: Tensor, reach: float = 0.0) -> Tensor:
         """Vertices, flat places (K,) int64, that are not known, of cells that share space with cells of another grid.
 
         Args:
             occupied: (Gx, Gy, Gz) bool, which of the other grid's.
             aabb: (2, 3) box that the other grid fills, in world units.
+            reach: by which its cells are larger, in every direction, in world units.
         """
         firsts, ends = [], []
         for axis, cell in enumerate(torch.unravel_index(few_nonzero(occupied), occupied.shape)):
             size, cells = occupied.shape[axis], self.levels.cells[axis]
             faces = torch.lerp(aabb[0, axis], aabb[1, axis], torch.linspace(0, 1, size + 1, device=aabb.device))
-            place = (faces - self.low[axis]) / self.sides[axis] * cells
-            firsts.append(place[:-1].floor().long()[cell])
-            ends.append(place[1:].ceil().long()[cell] + 1)
+            lows, highs = (
+                (x - self.low[axis]) / self.sides[axis] * cells for x in (faces[:-1] - reach, faces[1:] + reach)
+            )
+            firsts.append(lows.floor().long()[cell])
+            ends.append(highs.ceil().long()[cell] + 1)
         around = covered_places(torch.stack(firsts[::-1]), torch.stack(ends[::-1]), self.is_known.shape)
         return around[~self.is_known.view(-1)[around]]
 

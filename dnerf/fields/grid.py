@@ -14,7 +14,7 @@ from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField
 from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.geometry import check_last_axis
-from dnerf.kernels import GridLevels, grid_encode, is_bfloat16_wanted
+from dnerf.kernels import GridLevels, grid_encode, is_bfloat16_wanted, shade
 from dnerf.mlp import MLP
 
 
@@ -266,7 +266,11 @@ class GridFieldAtTime(RadianceField):
         check_positions_times(positions, times)
         check_one_time(times, self.time)
         seen = self.field._before_output(positions, times)
-        return self.field._activated_values(nn.functional.linear(seen, self.weight, self.bias))
+        if self.field.density_activation != "exp":
+            return self.field._activated_values(nn.functional.linear(seen, self.weight, self.bias))
+        products = nn.functional.linear(seen, self.weight).reshape(-1, 4)
+        density, rgb = shade(products, self.bias, self.field.density_shift)
+        return FieldOutput(density.reshape(times.shape), rgb.reshape(positions.shape))
 
 
 def _joined(features: Tensor, scale: Tensor | None, more: Tensor) -> tuple[Tensor, Tensor | None]:

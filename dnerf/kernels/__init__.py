@@ -14,6 +14,7 @@ from .packed_sum import packed_sum
 from .packed_weights import packed_weights
 from .relu_layers import is_bfloat16_wanted, relu_layers
 from .seen_parts import SeenParts, seen_parts
+from .shade import shade
 from .skip_distances import skip_distances
 from .thin_out import thin_out
 from .trace import FrameTables, trace
@@ -42,6 +43,7 @@ __all__ = [
     "relu_layers",
     "seen_parts",
     "set_backend",
+    "shade",
     "skip_distances",
     "thin_out",
     "trace",

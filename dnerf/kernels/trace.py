@@ -11,12 +11,12 @@ from .backend import choose, run_compiled
 from .brick_lookup import BRICK, VERTICES, brick_lookup_reference
 from .grid_encode import GridLevels, grid_encode_reference
 from .march import kept_intervals
+from .shade import MOST_LOG_DENSITY
 from .skip_distances import blocks_shape
 
 DONE, ELSEWHERE = -1, -2
 LACKS_VERTEX, LACKS_BRICK = 1, 2
 LOOK_AHEAD = 8  # kept intervals of a waiting ray whose vertices are asked for at once
-MOST_LOG_DENSITY = 15.0  # as `dnerf.fields.activations.truncated_exp`
 NUM_STATES = 5
 
 

@@ -90,6 +90,24 @@ def test_vertices_around_cells_are_those_that_points_in_them_ask_for() -> None:
     assert not len(lattice.at_time(IdentityDeformation(), 0.5).vertices_around(occupied & False, aabb))
 
 
+def test_parts_of_intervals_beside_cells_find_their_vertices_filled() -> None:
+    """Of an interval whose middle is in a cell, cut into three, two parts' middles may lie beside it."""
+    occupied = torch.rand(7, 5, 6, generator=torch.Generator().manual_seed(3)) < 0.1
+    grid = MarchGrid(occupied, skip_distances(occupied[None])[0], torch.tensor(BOX), 0.09, 3, 0.0)
+    frozen = FrameLattice(BOX, 40).at_time(Bend(), 0.5)
+    assert frozen.fill_around(grid, 10**6)
+    known = frozen.is_known.clone()
+    g = torch.Generator().manual_seed(4)
+    shares = (occupied.nonzero()[:, None] + torch.rand(200, 3, generator=g)) / torch.tensor(occupied.shape)
+    middles = torch.lerp(*grid.aabb, shares.reshape(-1, 3))
+    directions = torch.nn.functional.normalize(torch.randn(middles.shape, generator=g), dim=-1)
+    points = torch.cat([middles, middles - 0.03 * directions, middles + 0.03 * directions])
+    points = torch.maximum(torch.minimum(points, grid.aabb[1]), grid.aabb[0])
+    frozen(points, points.new_full((len(points),), 0.5))
+    assert torch.equal(frozen.is_known, known)
+    assert not known.all()
+
+
 def test_what_rays_will_want_is_filled_at_once_unless_it_is_too_much() -> None:
     occupied = torch.zeros(7, 5, 6, dtype=torch.bool)
     occupied[2:4, 1, 3:5] = True

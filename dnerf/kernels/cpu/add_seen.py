@@ -7,12 +7,11 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
-from .exponential import exp, expm1
 from .launch import BORROWS, kernel, launch, num_threads
-from .seen_parts import NOTHING, OPAQUE
+from .seen_weights import RAYS_AT_ONCE, weigh, weight_tables
 from .tasks import next_task, none_taken
 
-RAYS_AT_ONCE = 256  # dealt out to threads
+HALF = np.float32(0.5)
 
 
 def add_seen(
@@ -35,7 +34,8 @@ def add_seen(
     passing = light.new_empty(len(rays))
     arrays = (x.detach().contiguous().numpy() for x in (rays, light, starts, ends, offsets, density, rgb))
     points = None if distances is None else distances.detach().contiguous().numpy()
-    launch(_add_seen, sums.numpy(), *arrays, points, passing.numpy(), num_threads(), none_taken())
+    weights = weight_tables(len(starts))
+    launch(_add_seen, sums.numpy(), *arrays, points, passing.numpy(), weights, num_threads(), none_taken())
     return passing
 
 
@@ -52,25 +52,23 @@ def _add_seen(
     rgb: Any,
     distances: Any,
     passing: Any,
+    weights: Any,
     num_workers: int,
     taken: Any,
 ) -> None:
     for _ in prange(num_workers):
         first = next_task(taken) * RAYS_AT_ONCE
         while first < len(rays):
-            for r in range(first, min(first + RAYS_AT_ONCE, len(rays))):
-                behind, opacity, far = 0.0, 0.0, 0.0
-                red, green, blue = 0.0, 0.0, 0.0
+            last = min(first + RAYS_AT_ONCE, len(rays))
+            weigh(starts, ends, offsets, density, first, last, weights[0], weights[1])
+            for r in range(first, last):
+                red, green, blue, far, opacity = 0.0, 0.0, 0.0, 0.0, 0.0
                 for i in range(offsets[r], offsets[r + 1]):
-                    depth = density[i] * (ends[i] - starts[i])
-                    before = NOTHING if behind > OPAQUE else exp(-np.float32(behind))
-                    weight = before * -expm1(-depth)
-                    behind += depth
-                    middle = np.float32(0.5) * (starts[i] + ends[i]) if distances is None else distances[i]
+                    weight = weights[0, i]
                     red += weight * rgb[i, 0]
                     green += weight * rgb[i, 1]
                     blue += weight * rgb[i, 2]
-                    far += weight * middle
+                    far += weight * (HALF * (starts[i] + ends[i]) if distances is None else distances[i])
                     opacity += weight
                 opacity = 1.0 if opacity > 1 else opacity
                 passing[r] = 1 - opacity

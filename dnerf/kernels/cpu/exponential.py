@@ -21,17 +21,19 @@ P5, P4, P3, P2, P1, P0 = (
     np.float32(p) for p in (1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 0.5)
 )
 ROUNDS = np.float32(3 << 22)  # added and taken away again, it rounds to whole numbers
-BIAS, FRACTION_BITS = np.int32(127), np.int32(23)
+BIAS, FRACTION_BITS = 127, 23
 
 
 @intrinsic
-def _as_float(typing: Any, bits: Any) -> tuple[Any, Any]:
-    """The float32 of which an int32 has the bits."""
+def _power_of_two(typing: Any, exponent: Any) -> tuple[Any, Any]:
+    """2^n for a float32 n, a whole number from -126 to 127."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.FloatType())
+        word = ir.IntType(32)  # numba's own sums of such are of 64 bits, of which vectors hold half as many
+        bits = builder.shl(builder.add(builder.fptosi(arguments[0], word), word(BIAS)), word(FRACTION_BITS))
+        return builder.bitcast(bits, ir.FloatType())
 
-    return types.float32(types.int32), generate
+    return types.float32(types.float32), generate
 
 
 @njit(forceinline=True, **BORROWS)
@@ -42,7 +44,7 @@ def _parts(x: Any) -> Any:
     n = (x * LOG2_E + ROUNDS) - ROUNDS
     r = (x - n * LN2_HIGH) - n * LN2_LOW
     polynomial = ((((P5 * r + P4) * r + P3) * r + P2) * r + P1) * r + P0
-    return _as_float(np.int32((np.int32(n) + BIAS) << FRACTION_BITS)), r + r * r * polynomial
+    return _power_of_two(n), r + r * r * polynomial
 
 
 @njit(forceinline=True, **BORROWS)

@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 
 from ..brick_lookup import BRICK_BITS
-from ..trace import ELSEWHERE, LACKS_BRICK, LACKS_VERTEX, MOST_LOG_DENSITY
+from ..shade import MOST_LOG_DENSITY
+from ..trace import ELSEWHERE, LACKS_BRICK, LACKS_VERTEX
 from .brick_lookup import CORNERS, SIDE, cell_of, first_row, is_inside
 from .cells import locate
 from .exponential import exp, expm1

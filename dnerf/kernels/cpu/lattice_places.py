@@ -8,12 +8,14 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
+from .cells import PLACES, cell_tables, fractions_at, locate_all, rows_at
 from .course import LINE
-from .frame_lookup import blend_vertices, place_at
 from .launch import BORROWS, kernel, launch, num_threads
+from .rows import blend_rows
 from .tasks import next_task, none_taken
 
-PLACES_AT_ONCE = 512  # dealt out to threads
+NOTHING, ALL = np.float32(0), np.float32(1)
+NOWHERE = np.float32(np.nan)  # outside the lattice
 
 
 def lattice_places(
@@ -35,9 +37,11 @@ def lattice_places(
         x.detach().contiguous().numpy()
         for x in (origins, directions, ray_indices, distances, displacements, low, sides)
     )
-    columns = table.shape[1]
-    moved = np.empty((num_threads(), columns + LINE), np.float32)
-    launch(_places, o, d, rays, t, table, tuple(shape), low_, sides_, out.numpy(), moved, none_taken(), (0,) * columns)
+    columns, threads = table.shape[1], num_threads()
+    moved = np.empty((threads, columns + LINE), np.float32)
+    tables = cell_tables(np.float32, threads)
+    level = shape[2] - 1, shape[1] - 1, shape[0] - 1, 0, -1  # of which there is one, as `GridLevels.describe` gives it
+    launch(_places, o, d, rays, t, table, level, low_, sides_, out.numpy(), moved, tables, none_taken(), (0,) * columns)
     return out
 
 
@@ -49,27 +53,33 @@ def _places(
     ray_indices: Any,
     distances: Any,
     displacements: Any,
-    shape: Any,
+    level: Any,
     low: Any,
     sides: Any,
     out: Any,
     scratch: Any,
+    tables: Any,
     taken: Any,
     lanes: Any,
 ) -> None:
     for worker in prange(len(scratch)):
         moved = scratch[worker]
-        first = next_task(taken) * PLACES_AT_ONCE
+        places, fractions, rows = tables[0][worker], tables[1][worker], tables[2][worker]
+        first = next_task(taken) * PLACES
         while first < len(distances):
-            for i in range(first, min(first + PLACES_AT_ONCE, len(distances))):
-                r = ray_indices[i]
-                ray = (
-                    (origins[r, 0], origins[r, 1], origins[r, 2]),
-                    (directions[r, 0], directions[r, 1], directions[r, 2]),
-                )
-                is_in, place, cell, fractions = place_at(distances[i], ray, shape, low, sides)
-                if is_in:
-                    blend_vertices(displacements, shape, cell, fractions, moved, lanes)
+            count = min(PLACES, len(distances) - first)
+            for i in range(count):
+                r, t = ray_indices[first + i], distances[first + i]
                 for axis in range(3):
-                    out[i, axis] = place[axis] + moved[axis] if is_in else np.float32(np.nan)
-            first = next_task(taken) * PLACES_AT_ONCE
+                    places[axis, i] = out[first + i, axis] = origins[r, axis] + t * directions[r, axis]
+            for axis in range(3):
+                line = places[axis]
+                for i in range(count):
+                    share = (line[i] - low[axis]) / sides[axis]
+                    line[i] = share if NOTHING <= share <= ALL else NOWHERE
+            locate_all(places, count, level, rows, fractions)
+            for i in range(count):
+                blend_rows(displacements, 0, rows_at(rows, i), fractions_at(fractions, i), moved, 0, lanes)
+                for axis in range(3):
+                    out[first + i, axis] += moved[axis]
+            first = next_task(taken) * PLACES

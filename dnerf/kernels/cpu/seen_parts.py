@@ -8,12 +8,11 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from .exponential import exp, expm1
-from .launch import BORROWS, kernel, launch
+from .launch import BORROWS, kernel, launch, num_threads
+from .seen_weights import RAYS_AT_ONCE, weigh, weight_tables
+from .tasks import next_task, none_taken
 
 LEFT_OUT, WHOLE, CUT = 0, 1, 2
-OPAQUE = 87.0  # optical depth, behind which there is no light in single precision
-NOTHING = np.float32(0)
 
 
 def seen_parts(
@@ -32,7 +31,8 @@ def seen_parts(
     kinds = torch.empty(len(starts), dtype=torch.uint8)
     ranges = torch.zeros(2, len(offsets), dtype=torch.int64)  # of each ray's parts, and of those that are new
     options = splits, np.float32(split_weight), np.float32(min_weight)
-    launch(_choose, *arrays, options, kinds.numpy(), ranges.numpy())
+    workers = num_threads(), none_taken()
+    launch(_choose, *arrays, options, kinds.numpy(), ranges.numpy(), weight_tables(len(starts)), *workers)
     ranges = ranges.cumsum(1)
     size, num_new = (int(x) for x in ranges[:, -1])
     parts = starts.new_empty(2, size)
@@ -45,27 +45,40 @@ def seen_parts(
 # No fast-math: NaN weights are seen. Weights are of single precision, whatever lengths are.
 @kernel(**BORROWS)
 def _choose(
-    starts: Any, ends: Any, offsets: Any, density: Any, light: Any, options: Any, kinds: Any, ranges: Any
+    starts: Any,
+    ends: Any,
+    offsets: Any,
+    density: Any,
+    light: Any,
+    options: Any,
+    kinds: Any,
+    ranges: Any,
+    weights: Any,
+    num_workers: int,
+    taken: Any,
 ) -> None:
     """What becomes of every interval, and how many parts each ray gets."""
     splits, split_weight, min_weight = options
-    for r in prange(len(light)):
-        behind, size, num_new = 0.0, 0, 0
-        for i in range(offsets[r], offsets[r + 1]):
-            depth = density[i] * (ends[i] - starts[i])
-            before = NOTHING if behind > OPAQUE else exp(-np.float32(behind))
-            weight = before * -expm1(-np.float32(depth)) * np.float32(light[r])
-            behind += depth
-            if weight <= min_weight:
-                kinds[i] = LEFT_OUT
-            elif weight <= split_weight or splits == 1:
-                kinds[i] = WHOLE
-                size += 1
-            else:
-                kinds[i] = CUT
-                size += splits
-                num_new += splits - splits % 2
-        ranges[0, r + 1], ranges[1, r + 1] = size, num_new
+    for _ in prange(num_workers):
+        first = next_task(taken) * RAYS_AT_ONCE
+        while first < len(light):
+            last = min(first + RAYS_AT_ONCE, len(light))
+            weigh(starts, ends, offsets, density, first, last, weights[0], weights[1])
+            for r in range(first, last):
+                size, num_new = 0, 0
+                for i in range(offsets[r], offsets[r + 1]):
+                    weight = weights[0, i] * np.float32(light[r])
+                    if weight <= min_weight:
+                        kinds[i] = LEFT_OUT
+                    elif weight <= split_weight or splits == 1:
+                        kinds[i] = WHOLE
+                        size += 1
+                    else:
+                        kinds[i] = CUT
+                        size += splits
+                        num_new += splits - splits % 2
+                ranges[0, r + 1], ranges[1, r + 1] = size, num_new
+            first = next_task(taken) * RAYS_AT_ONCE
 
 
 @kernel(**BORROWS)
