@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dnerf.checks import check_positive
 
+MIDDLE = 0.5
 SAME_TIME = 1e-6  # frames no further from the origin than others are in with them
 
 
@@ -19,7 +20,8 @@ class TimeWindow:
     Source: D-NeRF's code (`precrop_iters_time`), there from time 0.
 
     Args:
-        origin: time in [0, 1] around which the window opens.
+        origin: time in [0, 1] around which the window opens; None for that at which the pictures show most of the
+            scene (`open_around` tells it; the middle of the film until then).
         end: fraction of training, in (0, 1], at which all frames are in.
         start: share of the frames that are in at first, in (0, 1]; one frame at least, and those of the same time.
 
@@ -27,17 +29,28 @@ class TimeWindow:
         ValueError: for numbers out of range.
     """
 
-    def __init__(self, origin: float = 0.0, end: float = 0.6, start: float = 0.05) -> None:
-        if not 0 <= origin <= 1:
-            raise ValueError(f"origin must be in [0, 1], got {origin}")
+    def __init__(self, origin: float | None = 0.0, end: float = 0.6, start: float = 0.05) -> None:
+        if origin is not None and not 0 <= origin <= 1:
+            raise ValueError(f"origin must be in [0, 1] or None, got {origin}")
         for name, value in (("end", end), ("start", start)):
             check_positive(name, value)
             if value > 1:
                 raise ValueError(f"{name} must be in (0, 1], got {value}")
-        self.origin = origin
+        self.origin = MIDDLE if origin is None else origin
+        self.is_given = origin is not None
         self.end = end
         self.start = start
         self._sorted: tuple[Tensor, Tensor, list[float]] | None = None  # times, their order, distances in that order
+
+    def open_around(self, time: float) -> None:
+        """Open around this time, unless another one was asked for.
+
+        Args:
+            time: in [0, 1], see `dnerf.silhouettes.most_shown_time`.
+        """
+        if not self.is_given:
+            self.origin = time
+            self._sorted = None
 
     def num_frames(self, count: int, progress: float) -> int:
         """How many of `count` frames are in at a progress in [0, 1]."""

@@ -26,6 +26,7 @@ from dnerf.records import Callback, Outcome, TrainingRecord
 from dnerf.recovery import Recovery
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder, RunState, advice_on_memory, fingerprint, max_bytes
+from dnerf.silhouettes import most_shown_time
 from dnerf.steps import Steps, next_num_rays, warm_up
 from dnerf.stopping import StopRequest, stop_requests
 from dnerf.time_window import TimeWindow
@@ -205,6 +206,8 @@ class Trainer:
         frames = frames.to(renderer.device)
         generator = torch.Generator(renderer.device).manual_seed(seed)
         modules: dict[str, nn.Module] = {"renderer": renderer, "losses": self.losses}
+        if self.time_window is not None and not self.time_window.is_given:
+            self.time_window.open_around(most_shown_time(frames))
         if self.error_map is not None:
             self.error_map.begin(frames)
             modules["error_map"] = self.error_map

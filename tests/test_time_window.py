@@ -82,7 +82,7 @@ def test_one_frame_is_always_in() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"origin": 1.5}, r"origin must be in \[0, 1\], got 1.5"),
+        ({"origin": 1.5}, r"origin must be in \[0, 1\] or None, got 1.5"),
         ({"end": 0.0}, "end must be"),
         ({"start": 2.0}, r"start must be in \(0, 1\], got 2.0"),
     ],
