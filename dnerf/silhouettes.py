@@ -101,7 +101,7 @@ def _views(poses: Tensor) -> tuple[Tensor, Tensor]:
     """How far cameras (F, 4, 4) are from the place that is nearest to all their axes, and in which directions."""
     eyes, axes = poses[:, :3, 3], -poses[:, :3, 2]
     across = torch.eye(3, dtype=poses.dtype) - axes[:, :, None] * axes[:, None, :]
-    # Axes that are all parallel meet nowhere: of all places that are as near, the one nearest to the origin of the world.
+    # Parallel axes meet nowhere: of all places that are as near, the one nearest to the world's origin.
     center = torch.linalg.pinv(across.sum(0), rtol=1e-6) @ (across @ eyes[:, :, None]).sum(0)[:, 0]
     away = eyes - center
     distances = away.norm(dim=-1)
