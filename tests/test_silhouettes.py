@@ -71,6 +71,19 @@ def test_what_keeps_its_shape_stays_in_the_middle(seed: int) -> None:
     assert most_shown_time(two_balls(torch.full((60,), 0.9), times, seed)) == MIDDLE
 
 
+def test_what_views_explain_is_no_change_with_time() -> None:
+    """A plate covers as much as the cosine at which it is seen."""
+    times = torch.linspace(0, 1, 100)
+    frames = two_balls(torch.zeros(100), times)
+    eyes = frames.poses[:, :3, 3]
+    cosines = eyes[:, 2].abs() / eyes.norm(dim=-1) * (4 / eyes.norm(dim=-1)) ** 2
+    frames.images[..., 3] = (255 * cosines)[:, None, None].to(torch.uint8)
+    found = silhouette_areas(frames)
+    assert found is not None
+    assert float(found.areas.max() - found.areas.min()) < 0.1
+    assert float(found.errors.max()) < 0.05
+
+
 def test_frames_that_tell_nothing_stay_in_the_middle() -> None:
     times = torch.linspace(0, 1, 60)
     frames = two_balls(apart_except_at(0.5, times), times)
