@@ -16,7 +16,7 @@ Show = Callable[[Rays, int, int], tuple[Tensor, Tensor]]
 FIRST_GUESS = 4  # places per ray, before one picture has told how many are wanted
 HEADROOM = 1.3  # places for what other poses and times want
 ROUND_TO = 2048  # places
-MOST_VIEWS = 4  # sizes of pictures, lenses and planes, each of which has memory of its own
+MOST_VIEWS = 4  # sizes of pictures, lenses, planes and ways to show them, each of which has memory of its own
 
 
 class FrameGraphs:
@@ -30,7 +30,7 @@ class FrameGraphs:
         self.device = device
         self._cache = GraphCache(device)
         self._sizes: dict[Hashable, tuple[int, int]] = {}
-        self._state: Hashable = None
+        self._places: Hashable = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "FrameGraphs":
         return FrameGraphs(self.device)
@@ -39,25 +39,28 @@ class FrameGraphs:
         return FrameGraphs, (self.device,)
 
     @torch.no_grad()
-    def picture(self, camera: Camera, time: float, *, chunk: int, state: Hashable, show: Show) -> Tensor:
+    def picture(
+        self, camera: Camera, time: float, *, chunk: int, way: Hashable, places: Hashable, show: Show
+    ) -> Tensor:
         """Columns (height * width, C) of what all pixels show.
 
         Args:
             camera: the view, on the model's device.
             time: in [0, 1].
             chunk: most rays at a time.
-            state: what decides, beside values of tensors, what is shown; another state drops all graphs.
+            way: what decides, beside values of tensors, what is shown; a few are kept.
+            places: of all tensors in memory; others drop all graphs.
             show: asks the device for nothing.
         """
         intrinsics = camera.intrinsics
         count = intrinsics.width * intrinsics.height
         rays = min(chunk, count)
-        view = (intrinsics, camera.near, camera.far, camera.pose.dtype, rays)
+        view = (intrinsics, camera.near, camera.far, camera.pose.dtype, rays, way)
         is_guess = view not in self._sizes
-        if state != self._state or (is_guess and len(self._sizes) == MOST_VIEWS):
+        if places != self._places or (is_guess and len(self._sizes) == MOST_VIEWS):
             self._cache.forget()
             self._sizes.clear()
-            self._state, is_guess = state, True
+            self._places, is_guess = places, True
         sizes = self._sizes.setdefault(view, (FIRST_GUESS * rays, FIRST_GUESS * rays))
         while True:
             parts, wanted = [], torch.zeros(2, dtype=torch.int64, device=self.device)

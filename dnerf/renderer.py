@@ -281,9 +281,9 @@ class Renderer(nn.Module):
         if self._frames is None or self._frames.device != self.device:
             self._frames = FrameGraphs(self.device)
         places = tuple(tensor.data_ptr() for tensor in chain(self.parameters(), self.buffers()))
-        state = (places, self.sampler.settings, self.precision, self.stop_transmittance, self.quadrature)
+        way = (self.sampler.settings, self.precision, self.stop_transmittance, self.quadrature)
         try:
-            return self._frames.picture(camera, time, chunk=chunk, state=state, show=self._fixed)
+            return self._frames.picture(camera, time, chunk=chunk, way=way, places=places, show=self._fixed)
         except torch.OutOfMemoryError:
             self._frames = None
             logger.warning("the GPU's memory does not suffice for a graph of %d rays: going on without", chunk)
