@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 ALIKE = 0.25  # most that colours of one body's sightings differ
 SIZES = 2.5  # most by which their radii do, as a factor
-WINDOW = 8  # sightings of which a path's next place is foretold
+WINDOW = 10  # sightings of which a path's next place is foretold
 GAP = 4  # frames in a row without a sighting after which a path ends
 MOST_SKIPPED = 1  # of them, behind which something that is not alone may be a path's last sighting
 AROUND = (-2, -1, 1, 2)  # frames beside three in a row that have to agree with them, two at least
@@ -20,6 +20,8 @@ MOST_TRIED = 400  # beginnings of paths
 STIFFNESS, STIFF = 0.1, 10.0  # weights of third differences: at first, and where a path does not turn
 TURN = 0.3  # of the scale of distances, from which third differences are a turn
 ROUNDS = 8  # of reweighting
+SURE = 0.1  # of the tolerance: a sighting that a curve passes further away hardly counts
+BESIDE = 0.1  # weight of a sighting that is not alone: its middle may be that of more than the body
 CURVED = 5  # sightings from which on a path is taken for curved
 
 
@@ -147,7 +149,9 @@ def without_stragglers(sightings: dict[int, Sighting]) -> dict[int, Sighting]:
     return kept
 
 
-def triangulated(sightings: Sequence[Sighting], degree: int, time: float, unit: float) -> Array:
+def triangulated(
+    sightings: Sequence[Sighting], degree: int, time: float, unit: float, *, scale: float | None = None
+) -> Array:
     """The polynomial in time that passes their rays most closely.
 
     Source: trajectory triangulation (Avidan and Shashua 2000): three rays of three times determine a straight path
@@ -158,19 +162,29 @@ def triangulated(sightings: Sequence[Sighting], degree: int, time: float, unit: 
         degree: of the polynomial.
         time: from which its argument counts.
         unit: of its argument, in time.
+        scale: distance from a ray, in world units, from which that hardly counts, see `Path.positions`, and neither
+            do sightings that are not alone; None takes all as they are.
 
     Returns:
         Coefficients (degree + 1, 3): the first is where it is at `time`.
     """
     count = degree + 1
-    matrix, right = np.zeros((count, 3, count, 3)), np.zeros((count, 3))
-    for sighting in sightings:
-        powers = ((sighting.time - time) / unit) ** np.arange(count)
-        matrix += powers[:, None, None, None] * powers[:, None] * sighting.across[:, None]
-        right += powers[:, None] * (sighting.across @ sighting.origin)
-    prior = np.diag([1e-9, 1e-9, *([1e-3] * (count - 2))])  # curves are weakly held back
-    full = matrix.reshape(3 * count, 3 * count) + np.kron(prior, np.eye(3))
-    return np.asarray(np.linalg.solve(full, right.reshape(-1)).reshape(count, 3), dtype=np.float64)
+    powers = ((np.array([s.time for s in sightings]) - time) / unit)[:, None] ** np.arange(count)
+    across = np.stack([s.across for s in sightings])
+    origins = np.stack([s.origin for s in sightings])
+    prior = np.kron(np.diag([1e-9, 1e-9, *([1e-3] * (count - 2))]), np.eye(3))  # curves are weakly held back
+    own = np.array([1.0 if scale is None or sighting.is_alone else BESIDE for sighting in sightings])
+    weights, rounds = own, 0
+    while True:
+        weighted = powers * weights[:, None]
+        matrix = np.einsum("nk,nl,nij->kilj", weighted, powers, across).reshape(3 * count, 3 * count)
+        right = np.einsum("nk,nij,nj->ki", weighted, across, origins).reshape(-1)
+        found = np.linalg.solve(matrix + prior, right).reshape(count, 3)
+        if scale is None or rounds == ROUNDS:
+            return np.asarray(found, dtype=np.float64)
+        misses = np.linalg.norm(np.einsum("nij,nj->ni", across, powers @ found - origins), axis=-1)
+        weights = own / (1 + (misses / scale) ** 2)
+        rounds += 1
 
 
 class PathSearch:
@@ -188,7 +202,7 @@ class PathSearch:
     """
 
     def __init__(
-        self, box: Sequence[Sequence[float]], tolerance: float, *, min_sightings: int = 8, min_share: float = 0.6
+        self, box: Sequence[Sequence[float]], tolerance: float, *, min_sightings: int = 8, min_share: float = 0.5
     ) -> None:
         self.low, self.high = (np.asarray(corner, dtype=float) for corner in box)
         self.tolerance = tolerance
@@ -299,7 +313,8 @@ class PathSearch:
     ) -> Sighting | None:
         """Which of the candidates at that time goes on from what is known, if any does."""
         is_curved = len(known) >= CURVED
-        curve = triangulated(known, 2 if is_curved else 1, time, unit)
+        degree, scale = (2, SURE * self.tolerance) if is_curved else (1, None)
+        curve = triangulated(known, degree, time, unit, scale=scale)
         if not self._is_inside(curve[0]):
             return None
         color = np.median([s.color for s in known], axis=0)

@@ -48,6 +48,44 @@ def test_a_curved_path_is_found_to_the_weight_that_holds_curves_back() -> None:
     np.testing.assert_allclose(triangulated(sightings, 2, 0.0, 0.02), truth, atol=2e-3)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_wrong_sighting_does_not_bend_a_curve_with_a_scale(seed: int) -> None:
+    """One of eight is of a body that melts with a larger one in its picture: its middle is beside the body's."""
+    generator = np.random.default_rng(seed)
+    truth = circle(TIMES, turns=1.0)
+    seen = [sighting(TIMES[i], truth[i], generator, noise=0.002) for i in range(20, 28)]
+    seen[4] = sighting(TIMES[24], truth[24] + 0.09 * generator.choice([-1, 1], 3), generator)
+    plain, robust = (
+        float(np.linalg.norm(triangulated(seen, 2, TIMES[29], 0.01, scale=scale)[0] - truth[29]))
+        for scale in (None, 0.01)
+    )
+    assert robust < 0.04
+    assert robust < plain
+
+
+@pytest.mark.parametrize("seed", range(5))  # with 5 there are five frames in a row without a sighting
+def test_a_body_is_followed_that_some_pictures_do_not_show_and_some_show_beside_its_place(seed: int) -> None:
+    """As a bead that circles a large ball: before that it is not told apart, at its edge it melts with it."""
+    generator = np.random.default_rng(seed)
+    truth = circle(TIMES, turns=1.0)
+    frames: list[list[Sighting]] = []
+    for i, time in enumerate(TIMES):
+        kind = generator.uniform()
+        if kind < 0.35:
+            frames.append([])
+        elif kind < 0.5:
+            seen = sighting(time, truth[i] + 0.05 * generator.choice([-1, 1], 3), generator)
+            frames.append([replace(seen, angle=1.35 * seen.angle, is_alone=False)])
+        else:
+            frames.append([sighting(time, truth[i], generator, noise=0.002)])
+    found = PathSearch(BOX, 0.1)(frames, TIMES.tolist())
+    assert len(found) == 1
+    shown = [number for number, seen in enumerate(frames) if seen]
+    assert min(found[0].sightings) <= shown[2]
+    assert max(found[0].sightings) >= shown[-3]
+    assert np.median(misses_of(TIMES, truth, found[0], scale=0.03)[shown[2] : shown[-3]]) < 0.02
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_two_bodies_are_followed_among_things_that_are_none(seed: int) -> None:
     """A seventh of the sightings missing, four false ones a frame, half of them parts of others; own rays 0.005 off."""
