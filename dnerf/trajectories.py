@@ -103,7 +103,7 @@ class Path:
         Least squares of distances from rays and of third differences; before and after all sightings it goes on as it
         went last. With a scale both are reweighted some rounds: a ray that is passed far away and a turn between two
         times then hardly count, so that single wrong sightings do not bend the path, and it is as stiff as bodies that
-        nothing hits.
+        nothing hits. Nor do sightings count much then that are not alone.
 
         Source: iteratively reweighted least squares (Holland and Welsch 1977) with Cauchy's weights.
 
@@ -122,7 +122,8 @@ class Path:
         origins = np.stack([sighting.origin for sighting in sightings])
         third, second = (np.diff(np.eye(count), n=n, axis=0) for n in (3, 2))
         slack = 1e-3 * STIFFNESS * second.T @ second + 1e-9 * np.eye(count)
-        weights, stiffness, rounds = np.ones(len(places)), np.full(count - 3, STIFFNESS), 0
+        own = trust(sightings, scale)
+        weights, stiffness, rounds = own, np.full(count - 3, STIFFNESS), 0
         while True:
             weighted = (shares * weights[:, None]).T
             matrix = np.einsum("in,nj,nab->iajb", weighted, shares, across, optimize=True)
@@ -132,9 +133,14 @@ class Path:
             if scale is None or rounds == ROUNDS:
                 return np.asarray(found, dtype=np.float64)
             misses = np.linalg.norm(np.einsum("nab,nb->na", across, shares @ found - origins), axis=-1)
-            weights = 1 / (1 + (misses / scale) ** 2)
+            weights = own / (1 + (misses / scale) ** 2)
             stiffness = STIFF / (1 + (np.linalg.norm(third @ found, axis=-1) / (TURN * scale)) ** 2)
             rounds += 1
+
+
+def trust(sightings: Sequence[Sighting], scale: float | None) -> Array:
+    """How much sightings (N,) count by themselves: less if they are not alone, unless all are taken as they are."""
+    return np.array([1.0 if scale is None or sighting.is_alone else BESIDE for sighting in sightings])
 
 
 def without_stragglers(sightings: dict[int, Sighting]) -> dict[int, Sighting]:
@@ -173,7 +179,7 @@ def triangulated(
     across = np.stack([s.across for s in sightings])
     origins = np.stack([s.origin for s in sightings])
     prior = np.kron(np.diag([1e-9, 1e-9, *([1e-3] * (count - 2))]), np.eye(3))  # curves are weakly held back
-    own = np.array([1.0 if scale is None or sighting.is_alone else BESIDE for sighting in sightings])
+    own = trust(sightings, scale)
     weights, rounds = own, 0
     while True:
         weighted = powers * weights[:, None]

@@ -168,6 +168,21 @@ def test_single_wrong_sightings_do_not_bend_a_path_with_a_scale(seed: int) -> No
 
 
 @pytest.mark.parametrize("seed", range(4))
+def test_a_path_does_not_end_at_what_is_not_alone_with_a_scale(seed: int) -> None:
+    """Its first two sightings are beside its place: a path that trusts them goes on from there."""
+    generator = np.random.default_rng(seed)
+    truth = circle(TIMES, turns=1.0)
+    seen = {i: sighting(TIMES[i], truth[i], generator, noise=0.002) for i in range(3, 60)}
+    for number in (3, 4):
+        beside = sighting(TIMES[number], truth[number] + 0.06 * generator.choice([-1, 1], 3), generator)
+        seen[number] = replace(beside, is_alone=False)
+    trusted = Path({number: replace(each, is_alone=True) for number, each in seen.items()})
+    first = misses_of(TIMES, truth, Path(seen), scale=0.03)[:4].max()
+    assert first < 0.15
+    assert first < misses_of(TIMES, truth, trusted, scale=0.03)[:4].max()
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_with_a_scale_paths_are_stiff_but_bounce(seed: int) -> None:
     """Off the sharp turn no further than a ball of 0.06 would show, and elsewhere as near as rays allow."""
     generator = np.random.default_rng(seed)
