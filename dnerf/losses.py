@@ -260,24 +260,40 @@ class SmoothKnotsLoss(Loss):
     """Roughness of what deformations learn of single moments, see `TimeEncoding`: squared differences of neighbours.
 
     Knots that lie between two frames learn nothing from pictures; with this they are between their neighbours, and
-    after the last frame they are as the last one that was seen.
+    after the last frame they are as the last one that was seen. Each moment is seen by few cameras, often by one, and
+    the longer they are looked at the more closely motion is bent to each of them: what is lost then as training stops
+    late, the loss makes up for. Its weight grows in proportion to the rays, from a number for each knot on.
 
     Args:
         weight: factor of their mean.
+        rays_per_knot: of the batches it is called with, for each knot in use, from which on the weight grows; None for
+            a weight that stays.
 
     Raises:
-        ValueError: for a negative weight.
+        ValueError: for a negative weight, or a number of rays that is not positive.
     """
 
-    def __init__(self, weight: float = 1e-3) -> None:
+    def __init__(self, weight: float = 1e-3, *, rays_per_knot: int | None = 25_000) -> None:
         super().__init__()
         check_positive("weight", weight, allow_zero=True)
+        if rays_per_knot is not None:
+            check_positive("rays_per_knot", rays_per_knot)
         self.weight = weight
+        self.rays_per_knot = rays_per_knot
+        self.register_buffer("num_rays", torch.zeros((), dtype=torch.int64))
+        self.num_rays: Tensor
 
     def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
-        """See `Loss`; only the field matters here, and one without knots costs nothing."""
+        """See `Loss`; of the rendering only the number of rays matters, and a field without knots costs nothing."""
         total = rendering.rgb.new_zeros(())
+        self.to(rendering.rgb.device)
+        self.num_rays += len(rendering.rgb)  # a tensor: graphs that replay steps go on counting
         for part in renderer.field.modules():
             if isinstance(part, TimeEncoding) and part.knots is not None:
-                total = total + self.weight * part.roughness()
+                total = total + self.weight * self._growth(part) * part.roughness()
         return total
+
+    def _growth(self, encoding: TimeEncoding) -> Tensor | float:
+        if self.rays_per_knot is None:
+            return 1.0
+        return (self.num_rays / (self.rays_per_knot * encoding.num_used)).clamp(min=1)

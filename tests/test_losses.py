@@ -283,7 +283,7 @@ def test_knots_of_which_pictures_say_nothing_are_between_their_neighbours_or_as_
     assert knots is not None
     with torch.no_grad():
         knots[:, 0] = torch.tensor([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
-    loss = SmoothKnotsLoss(3.0)
+    loss = SmoothKnotsLoss(3.0, rays_per_knot=None)
     assert loss(picture(rgb), rgb, renderer).item() == pytest.approx(3.0 * (0.25 + 4.0 + 4.0) / 5, rel=1e-6)
     optimizer = torch.optim.Adam([knots], lr=0.02)
     for _ in range(600):
@@ -296,9 +296,29 @@ def test_knots_of_which_pictures_say_nothing_are_between_their_neighbours_or_as_
     torch.testing.assert_close(knots.detach()[:, 0], expected, rtol=0, atol=0.02)
 
 
+def test_the_longer_moments_are_looked_at_the_smoother_they_have_to_be() -> None:
+    """In proportion to rays, from a number for each knot on: 6 knots of 5 rays each, 2 rays a call."""
+    deformation = DisplacementDeformation(1, 8, (), time_knots=6, knot_features=1)
+    renderer = Renderer(DeformedField(deformation, fog()), StratifiedSampler(4))
+    rgb = torch.rand(2, 3)
+    knots = deformation.encode_times.knots
+    assert knots is not None
+    with torch.no_grad():
+        knots[:, 0] = torch.tensor([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
+    loss = SmoothKnotsLoss(2.0, rays_per_knot=5)
+    found = [loss(picture(rgb), rgb, renderer).item() for _ in range(60)]
+    expected = [2.0 * max(1, 2 * (call + 1) / 30) * 8.25 / 5 for call in range(60)]
+    assert found == pytest.approx(expected, rel=1e-5)
+    going_on = SmoothKnotsLoss(2.0, rays_per_knot=5)
+    going_on.load_state_dict(loss.state_dict())
+    assert going_on(picture(rgb), rgb, renderer).item() == pytest.approx(2.0 * 122 / 30 * 8.25 / 5, rel=1e-5)
+
+
 def test_what_has_no_knots_is_not_rough() -> None:
     rgb = torch.rand(2, 3)
     assert SmoothKnotsLoss()(picture(rgb), rgb, RENDERER).item() == 0
     assert DisplacementDeformation(1, 8, ()).encode_times.roughness().item() == 0
     with pytest.raises(ValueError, match="weight must be >= 0"):
         SmoothKnotsLoss(-1.0)
+    with pytest.raises(ValueError, match="rays_per_knot must be"):
+        SmoothKnotsLoss(rays_per_knot=0)
