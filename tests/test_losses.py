@@ -275,14 +275,19 @@ def test_rough_volumes_cost_once_they_have_joined() -> None:
         SmoothVolumesLoss(time_weight=-1.0)
 
 
-def test_knots_of_which_pictures_say_nothing_are_between_their_neighbours_or_as_the_last() -> None:
-    deformation = DisplacementDeformation(1, 8, (), time_knots=6, knot_features=1)
-    renderer = Renderer(DeformedField(deformation, fog()), StratifiedSampler(4))
-    rgb = torch.rand(2, 3)
+def of_knots(values: list[float]) -> tuple[Renderer, torch.nn.Parameter]:
+    """A model whose deformation has learnt one feature of as many moments, and these."""
+    deformation = DisplacementDeformation(1, 8, (), time_knots=len(values), knot_features=1)
     knots = deformation.encode_times.knots
     assert knots is not None
     with torch.no_grad():
-        knots[:, 0] = torch.tensor([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
+        knots[:, 0] = torch.tensor(values)
+    return Renderer(DeformedField(deformation, fog()), StratifiedSampler(4)), knots
+
+
+def test_knots_of_which_pictures_say_nothing_are_between_their_neighbours_or_as_the_last() -> None:
+    renderer, knots = of_knots([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
+    rgb = torch.rand(2, 3)
     loss = SmoothKnotsLoss(3.0, rays_per_knot=None)
     assert loss(picture(rgb), rgb, renderer).item() == pytest.approx(3.0 * (0.25 + 4.0 + 4.0) / 5, rel=1e-6)
     optimizer = torch.optim.Adam([knots], lr=0.02)
@@ -298,13 +303,8 @@ def test_knots_of_which_pictures_say_nothing_are_between_their_neighbours_or_as_
 
 def test_the_longer_moments_are_looked_at_the_smoother_they_have_to_be() -> None:
     """In proportion to rays, from a number for each knot on: 6 knots of 5 rays each, 2 rays a call."""
-    deformation = DisplacementDeformation(1, 8, (), time_knots=6, knot_features=1)
-    renderer = Renderer(DeformedField(deformation, fog()), StratifiedSampler(4))
+    renderer, _ = of_knots([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
     rgb = torch.rand(2, 3)
-    knots = deformation.encode_times.knots
-    assert knots is not None
-    with torch.no_grad():
-        knots[:, 0] = torch.tensor([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
     loss = SmoothKnotsLoss(2.0, rays_per_knot=5)
     found = [loss(picture(rgb), rgb, renderer).item() for _ in range(60)]
     expected = [2.0 * max(1, 2 * (call + 1) / 30) * 8.25 / 5 for call in range(60)]
