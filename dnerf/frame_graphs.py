@@ -30,7 +30,7 @@ class FrameGraphs:
         self.device = device
         self._cache = GraphCache(device)
         self._sizes: dict[Hashable, tuple[int, int]] = {}
-        self._places: Hashable = None
+        self._memory: Hashable = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "FrameGraphs":
         return FrameGraphs(self.device)
@@ -40,7 +40,7 @@ class FrameGraphs:
 
     @torch.no_grad()
     def picture(
-        self, camera: Camera, time: float, *, chunk: int, way: Hashable, places: Hashable, show: Show
+        self, camera: Camera, time: float, *, chunk: int, way: Hashable, memory: Hashable, show: Show
     ) -> Tensor:
         """Columns (height * width, C) of what all pixels show.
 
@@ -49,7 +49,7 @@ class FrameGraphs:
             time: in [0, 1].
             chunk: most rays at a time.
             way: what decides, beside values of tensors, what is shown; a few are kept.
-            places: of all tensors in memory; others drop all graphs.
+            memory: where all tensors lie; elsewhere, all graphs are dropped.
             show: asks the device for nothing.
         """
         intrinsics = camera.intrinsics
@@ -57,10 +57,10 @@ class FrameGraphs:
         rays = min(chunk, count)
         view = (intrinsics, camera.near, camera.far, camera.pose.dtype, rays, way)
         is_guess = view not in self._sizes
-        if places != self._places or (is_guess and len(self._sizes) == MOST_VIEWS):
+        if memory != self._memory or (is_guess and len(self._sizes) == MOST_VIEWS):
             self._cache.forget()
             self._sizes.clear()
-            self._places, is_guess = places, True
+            self._memory, is_guess = memory, True
         sizes = self._sizes.setdefault(view, (FIRST_GUESS * rays, FIRST_GUESS * rays))
         while True:
             parts, wanted = [], torch.zeros(2, dtype=torch.int64, device=self.device)

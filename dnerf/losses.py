@@ -261,8 +261,8 @@ class SmoothKnotsLoss(Loss):
 
     Knots that lie between two frames learn nothing from pictures; with this they are between their neighbours, and
     after the last frame they are as the last one that was seen. Each moment is seen by few cameras, often by one, and
-    the longer they are looked at the more closely motion is bent to each of them: what is lost then as training stops
-    late, the loss makes up for. Its weight grows in proportion to the rays, from a number for each knot on.
+    in a long training motion may be bent to that one. So the weight grows in proportion to the rays, from a number of
+    them for each knot on.
 
     Args:
         weight: factor of their mean.

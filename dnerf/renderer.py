@@ -280,10 +280,10 @@ class Renderer(nn.Module):
         """A picture (P, 5) as one graph, which holds while tensors stay where they are; None for lack of memory."""
         if self._frames is None or self._frames.device != self.device:
             self._frames = FrameGraphs(self.device)
-        places = tuple(tensor.data_ptr() for tensor in chain(self.parameters(), self.buffers()))
+        memory = tuple(tensor.data_ptr() for tensor in chain(self.parameters(), self.buffers()))
         way = (self.sampler.settings, self.precision, self.stop_transmittance, self.quadrature)
         try:
-            return self._frames.picture(camera, time, chunk=chunk, way=way, places=places, show=self._fixed)
+            return self._frames.picture(camera, time, chunk=chunk, way=way, memory=memory, show=self._fixed)
         except torch.OutOfMemoryError:
             self._frames = None
             logger.warning("the GPU's memory does not suffice for a graph of %d rays: going on without", chunk)

@@ -21,7 +21,7 @@ STIFFNESS, STIFF = 0.1, 10.0  # weights of third differences: at first, and wher
 TURN = 0.3  # of the scale of distances, from which third differences are a turn
 ROUNDS = 8  # of reweighting
 SURE = 0.1  # of the tolerance: a sighting that a curve passes further away hardly counts
-BESIDE = 0.1  # weight of a sighting that is not alone: its middle may be that of more than the body
+MELTED = 0.1  # weight of a sighting that is not alone: its middle may be that of more than the body
 CURVED = 5  # sightings from which on a path is taken for curved
 
 
@@ -122,7 +122,7 @@ class Path:
         origins = np.stack([sighting.origin for sighting in sightings])
         third, second = (np.diff(np.eye(count), n=n, axis=0) for n in (3, 2))
         slack = 1e-3 * STIFFNESS * second.T @ second + 1e-9 * np.eye(count)
-        own = trust(sightings, scale)
+        own = _trust(sightings, scale)
         weights, stiffness, rounds = own, np.full(count - 3, STIFFNESS), 0
         while True:
             weighted = (shares * weights[:, None]).T
@@ -138,9 +138,9 @@ class Path:
             rounds += 1
 
 
-def trust(sightings: Sequence[Sighting], scale: float | None) -> Array:
+def _trust(sightings: Sequence[Sighting], scale: float | None) -> Array:
     """How much sightings (N,) count by themselves: less if they are not alone, unless all are taken as they are."""
-    return np.array([1.0 if scale is None or sighting.is_alone else BESIDE for sighting in sightings])
+    return np.array([1.0 if scale is None or sighting.is_alone else MELTED for sighting in sightings])
 
 
 def without_stragglers(sightings: dict[int, Sighting]) -> dict[int, Sighting]:
@@ -179,7 +179,7 @@ def triangulated(
     across = np.stack([s.across for s in sightings])
     origins = np.stack([s.origin for s in sightings])
     prior = np.kron(np.diag([1e-9, 1e-9, *([1e-3] * (count - 2))]), np.eye(3))  # curves are weakly held back
-    own = trust(sightings, scale)
+    own = _trust(sightings, scale)
     weights, rounds = own, 0
     while True:
         weighted = powers * weights[:, None]

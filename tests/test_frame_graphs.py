@@ -40,7 +40,7 @@ def trained(device: str = "cpu", *, graphs: bool = False) -> Renderer:
 
 
 def pictured(graphs: FrameGraphs, renderer: Renderer, view: Camera, time: float, chunk: int = 10000) -> Tensor:
-    return graphs.picture(view, time, chunk=chunk, way=0, places=0, show=renderer._fixed)
+    return graphs.picture(view, time, chunk=chunk, way=0, memory=0, show=renderer._fixed)
 
 
 @pytest.mark.parametrize("chunk", [480, 100, 7])
@@ -67,7 +67,7 @@ def test_sizes_grow_until_all_fits() -> None:
 
     graphs = FrameGraphs(torch.device("cpu"))
     for time in (0.0, 0.1, 0.9, 0.2):
-        picture = graphs.picture(camera(torch.device("cpu")), time, chunk=1000, way=0, places=0, show=show)
+        picture = graphs.picture(camera(torch.device("cpu")), time, chunk=1000, way=0, memory=0, show=show)
         assert picture.shape == (480, 1)
         torch.testing.assert_close(picture, torch.full_like(picture, time))
     assert asked[0] == (1920, 1920)  # a guess
@@ -94,8 +94,8 @@ def test_ways_to_show_a_view_are_kept_until_tensors_move() -> None:
         return rays.times[:, None].clone(), torch.tensor([5000, 5000])
 
     graphs, view = FrameGraphs(torch.device("cpu")), camera(torch.device("cpu"))
-    for way, places in ((3, 0), (1, 0), (3, 0), (1, 0), (3, 1)):
-        graphs.picture(view, 0.5, chunk=1000, way=way, places=places, show=show)
+    for way, memory in ((3, 0), (1, 0), (3, 0), (1, 0), (3, 1)):
+        graphs.picture(view, 0.5, chunk=1000, way=way, memory=memory, show=show)
     guess, known = (1920, 1920), (8192, 8192)
     assert asked == [guess, known, guess, known, known, known, guess, known]
 
@@ -118,9 +118,9 @@ def test_a_picture_waits_once() -> None:
 
     with kernels.use_backend("triton"):
         view = replace(camera(renderer.device), intrinsics=Intrinsics(4, 3, 5.0, 5.0))
-        graphs.picture(view, 0.5, chunk=100, way=0, places=0, show=show)
+        graphs.picture(view, 0.5, chunk=100, way=0, memory=0, show=show)
         inside.clear()
-        graphs.picture(view, 0.5, chunk=100, way=0, places=0, show=show)
+        graphs.picture(view, 0.5, chunk=100, way=0, memory=0, show=show)
     assert inside == []
 
 
