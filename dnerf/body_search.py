@@ -23,6 +23,7 @@ logger = logging.getLogger(__name__)
 LAST = 0.9  # progress, after which what is found cannot be learnt any more
 ROOM = 1.6  # times a body's radius, in which it is carried
 BORDER = 0.02  # and so much more, in world units
+BESIDE = 0.5  # of the error from which a body is missing, if another one is
 FAR = 0.3  # of the tolerance, from a body's path: a sighting that hardly counts
 CANDIDATES = 4096  # for a home
 TIMES = 16  # at which it has to be empty
@@ -44,16 +45,17 @@ class BodySearch:
     no gradient leads a deformation to it. But single pictures show it, as a patch of wrong pixels where there is
     matter, and rays through the patches of a few frames in a row determine its path (`dnerf.trajectories`). What is
     found that way, and is too fast to be found by gradients, is given to the field's `CarriedBodies`: matter that moves
-    along that path, of which nothing else is known yet. Which pixels are wrong is known from the `ErrorMap`; only
-    the pixels of what would be carried are rendered, to see whether they are wrong indeed. Where space-time volumes
-    have joined, they show such bodies, and nothing is looked for.
+    along that path, of which nothing else is known yet. The deformation begins anew: it has bent what lies around such
+    bodies in following them as far as it could. Which pixels are wrong is known from the `ErrorMap`; only the pixels of
+    what would be carried are rendered, to see whether they are wrong indeed. Where space-time volumes have joined, they
+    show such bodies, and nothing is looked for.
 
     Args:
         box: (2, 3) corners of where bodies may be, and homes are made, in world units.
         begin: progress of training, in [0, 1), from which it is due, once all frames are in; never in the last tenth.
         min_steps: before which it is not: until then everything is wrong.
         error: mean squared error of colours from which a block of pixels is wrong.
-        missing: squared error above which most pixels of a body have to be.
+        missing: squared error above which most pixels of a body have to be, or of another one; then half of it will do.
         resolution: about which pictures are reduced to, in pixels along the longer side.
         max_share: of a picture, that a sighting may fill.
         min_speed: radii that a body moves between two frames, from which it is too fast.
@@ -126,17 +128,27 @@ class BodySearch:
         search = PathSearch(self.box.tolist(), tolerance)
         paths = search([sightings[number] for number in chosen], times.tolist())
         spacing = float(times.diff().median()) if len(paths) else 0.0
-        found = [
-            body for body in joined_bodies(fast_bodies(paths, self.min_speed), spacing)
-            if self._is_missing(body, renderer, frames)
-        ]  # fmt: skip
+        found = self._missing(joined_bodies(fast_bodies(paths, self.min_speed), spacing), renderer, frames)
         room = len(bodies.radii) - bodies.num_bodies
         tracks = [
             (body.track(bodies.num_knots, spacing, FAR * tolerance).to(bodies.tracks), ROOM * body.radius + BORDER)
             for body in found[:room]
         ]
+        count = self._carry(tracks, renderer, bodies) if tracks else 0
+        if count:
+            logger.info("step %d: %d paths of small fast bodies found; the field carries them", step, count)
+        return count > 0
+
+    def _carry(self, tracks: Sequence[tuple[Tensor, float]], renderer: Renderer, bodies: CarriedBodies) -> int:
+        """Carry bodies of those tracks and radii, as far as homes are found; of how many they were.
+
+        The deformation begins anew: what could not follow them has bent what lies around them.
+        """
+        assert isinstance(renderer.field, DeformedField)
+        deformation, num_before = renderer.field.deformation, bodies.num_bodies
+        before = {name: value.clone() for name, value in deformation.state_dict().items()}
+        deformation.begin_anew()
         generator = torch.Generator().manual_seed(0)
-        num_before = bodies.num_bodies
         for track, radius in tracks:
             taken = list(zip(bodies.homes, bodies.radii.tolist()))[: bodies.num_bodies]
             home = self._home(renderer, radius, tracks, taken, generator)
@@ -145,9 +157,9 @@ class BodySearch:
                 self._plant(renderer, home, radius, generator)
                 self._call_attention(renderer, bodies, generator)
         count = bodies.num_bodies - num_before
-        if count:
-            logger.info("step %d: %d paths of small fast bodies found; the field carries them", step, count)
-        return count > 0
+        if not count:
+            deformation.load_state_dict(before)
+        return count
 
     def sightings(self, frames: Frames, error_map: ErrorMap) -> list[list[Sighting]]:
         """What small things each frame shows where training's pictures are wrong, largest first."""
@@ -155,8 +167,18 @@ class BodySearch:
             frames, error_map, error=self.error, resolution=self.resolution, max_share=self.max_share
         )
 
-    def _is_missing(self, body: FastBody, renderer: Renderer, frames: Frames) -> bool:
-        """Whether the model's pictures are wrong all over a body, and not at its edges only, or beside its place.
+    def _missing(self, bodies: Sequence[FastBody], renderer: Renderer, frames: Frames) -> list[FastBody]:
+        """Those that the model's pictures miss, and beside such ones those that they half miss.
+
+        What is so fast that some of it is missing altogether is followed only by bending what lies around it.
+        Source: thresholds of two heights (Canny 1986).
+        """
+        errors = [self._error_of(body, renderer, frames) for body in bodies]
+        least = self.missing * (BESIDE if max(errors, default=0.0) > self.missing else 1)
+        return [body for body, error in zip(bodies, errors, strict=True) if error > least]
+
+    def _error_of(self, body: FastBody, renderer: Renderer, frames: Frames) -> float:
+        """How wrong the model's pictures are all over a body, and not at its edges only, or beside its place.
 
         What the error map knows of a block are a few pixels. Hands that motion has all but found are wrong at their
         edges, and the model is left to find them.
@@ -174,7 +196,7 @@ class BodySearch:
             differences = [light + left * (other - behind) - composite_on(rgba, other) for other in others]
             errors.append(torch.stack(differences).square().mean((0, -1)))
         renderer.train()
-        return float(torch.cat(errors).median()) > self.missing
+        return float(torch.cat(errors).median())
 
     def _home(
         self,

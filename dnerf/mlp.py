@@ -66,7 +66,12 @@ class MLP(nn.Module):
         for layer in hidden:
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
-        if zero_output and self.output is not None:
+        self.zero_output = zero_output
+        self.rest()
+
+    def rest(self) -> None:
+        """Be zero again, as at initialisation, if it was zero then; hidden layers stay as they are."""
+        if self.zero_output and self.output is not None:
             nn.init.zeros_(self.output.weight)
             nn.init.zeros_(self.output.bias)
 

@@ -305,6 +305,45 @@ def test_what_pictures_show_about_where_it_is_is_not_carried(frames: Frames, is_
     assert found == [False, False, True]
 
 
+def test_what_is_half_missing_is_carried_beside_what_is_missing(frames: Frames) -> None:
+    """Of two fast bodies a deformation may have begun to follow one, by bending what lies around it."""
+    other = replace(FAST, phase=FAST.phase + 0.4)
+
+    def scene(density: float, other_density: float) -> AnalyticScene:
+        balls = [
+            Body(Ball(0.12), Plain(color), motion, each)
+            for color, motion, each in ((RED, FAST, density), (BLUE, other, other_density))
+            if each
+        ]
+        return AnalyticScene(balls, box=BOX)
+
+    pictures = SyntheticData(scene(200.0, 200.0), 48, num_train=NUM_FRAMES).frames("train")
+    found = []
+    for shown in (scene(200.0, 7.0), scene(0.0, 7.0), scene(0.0, 200.0)):
+        field = DeformedField(IdentityDeformation(), shown, bodies=CarriedBodies(4, NUM_FRAMES))
+        renderer = Renderer(field, OccupancySampler(BOX, 0.03, 24, num_probes=512, pad_to=1), RandomBackground())
+        BodySearch(BOX)(200, renderer, pictures, wrong_where_matter_is(pictures))
+        found.append(bodies_of(renderer).num_bodies)
+    assert found == [0, 2, 1]
+
+
+def test_the_deformation_begins_anew_if_something_is_carried(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+    def deforms_after(error_map: ErrorMap) -> bool:
+        renderer = a_renderer()
+        assert isinstance(renderer.field, DeformedField)
+        deformation = renderer.field.deformation = DisplacementDeformation(1, 8, (), canonical_time=None)
+        torch.nn.init.constant_(deformation.mlp.output.bias, 0.01)
+        BodySearch(BOX)(300, renderer, frames, error_map)
+        points = torch.rand(5, 3)
+        return not torch.equal(deformation(points, torch.rand(5)), points)
+
+    wrong = wrong_where_matter_is(frames)
+    assert not deforms_after(wrong)
+    assert deforms_after(wrong_where_matter_is(frames, is_known=False))
+    monkeypatch.setattr(BodySearch, "_home", lambda *_: None)  # no place is free
+    assert deforms_after(wrong)
+
+
 def test_opaque_pictures_tell_as_much(frames: Frames) -> None:
     picture = frames.images.float()
     on_white = (picture[..., :3] + 255 - picture[..., 3:]).round().to(torch.uint8)

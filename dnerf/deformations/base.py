@@ -1,11 +1,20 @@
 """What a deformation is: a map from world to canonical positions, one time per position."""
 
 from abc import ABC, abstractmethod
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
 from dnerf.checks import check_batch
 from dnerf.geometry import check_last_axis
+
+
+@runtime_checkable
+class BeginsAtZero(Protocol):
+    """A part that may be zero at initialisation, so that what it moves stays where it is."""
+
+    def rest(self) -> None:
+        """Be zero again, if it was zero then."""
 
 
 class Deformation(nn.Module, ABC):
@@ -22,6 +31,12 @@ class Deformation(nn.Module, ABC):
         Returns:
             (..., 3) canonical positions in world units: positions, never offsets.
         """
+
+    def begin_anew(self) -> None:
+        """Be the identity again, as at initialisation; what its last layers see stays as it is."""
+        for part in self.modules():
+            if isinstance(part, BeginsAtZero):
+                part.rest()
 
 
 class InvertibleDeformation(Deformation):

@@ -98,6 +98,18 @@ def test_initial_deformation_is_the_identity(name: str) -> None:
 
 
 @every_deformation
+def test_a_deformation_that_begins_anew_is_the_identity(name: str) -> None:
+    positions, times = some_points(50, dtype=torch.float32)
+    deformation = trained(name, torch.float32)
+    deformation(positions, times)
+    deformation.begin_anew()
+    assert torch.equal(deformation(positions, times), positions)
+    if name in TRAINABLE:  # and can learn again
+        deformation(positions, times).square().sum().backward()
+        assert any(torch.count_nonzero(p.grad) for p in deformation.parameters() if p.grad is not None)
+
+
+@every_deformation
 def test_mixed_times_equal_one_time_after_the_other(name: str) -> None:
     deformation = trained(name)
     positions, times = some_points(9)

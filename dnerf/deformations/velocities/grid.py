@@ -54,6 +54,11 @@ class GridVelocity(Velocity):
             nn.init.uniform_(self.values, -1e-1, 1e-1)
             self.network = MLP(num_features, hidden_features, 1, out_features=3, zero_output=True)
 
+    def rest(self) -> None:
+        """Be zero again, as at initialisation; features of a network stay as they are."""
+        if self.network is None:
+            nn.init.zeros_(self.values)
+
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Velocity (..., 3) at positions (..., 3) and times (...,); times outside [0, 1] count as 0 or 1."""
         return self.at(times)(positions)
