@@ -273,7 +273,7 @@ class SmoothKnotsLoss(Loss):
         ValueError: for a negative weight, or a number of rays that is not positive.
     """
 
-    def __init__(self, weight: float = 1e-3, *, rays_per_knot: int | None = 25_000) -> None:
+    def __init__(self, weight: float = 1e-3, *, rays_per_knot: int | None = 5_000) -> None:
         super().__init__()
         check_positive("weight", weight, allow_zero=True)
         if rays_per_knot is not None:
