@@ -11,6 +11,7 @@ from dnerf.deformations.base import Deformation, check_positions_times
 NOWHERE = 1e4
 """Coordinate of a track while its body is not there; nothing is shown half as far out or further."""
 LEAST_KNOTS = 4  # of a path that may bend
+LEARNT_WITH = 3.0  # knots: standard deviation of the weights with which they share gradients
 ROUNDING = 1e-3  # of a radius, by which a line may seem to miss a ball
 
 
@@ -20,8 +21,12 @@ class CarriedBodies(nn.Module):
     A field and a deformation behind it then see a fast body at rest, at its home, which has to be an empty place off
     all tracks; what is empty there lies around the body instead. At each time the map permutes the points of space: it
     moves balls as they are and changes nothing else, so it is its own inverse (of several bodies: the exchanges in
-    reverse order). Tracks are learnt: their knots take gradients from samples near the body. While a body is not there,
-    its track is `NOWHERE`, and whoever asks at home is sent there.
+    reverse order). While a body is not there, its track is `NOWHERE`, and whoever asks at home is sent there.
+
+    Tracks are learnt from samples near the body. In training mode a knot shares its gradient with those around it
+    (`LEARNT_WITH`): a moment that one camera sees says nothing of the depth, and knots that learn by themselves lose
+    the smooth path with which they began.
+    Source: gradients in a smoother inner product (Neuberger, "Sobolev Gradients and Differential Equations", 1997).
 
     Args:
         max_bodies: for how many there is room.
@@ -40,9 +45,12 @@ class CarriedBodies(nn.Module):
         self.register_buffer("homes", torch.zeros(max_bodies, 3))
         self.register_buffer("radii", torch.zeros(max_bodies))
         self.register_buffer("searched", torch.tensor(False))
+        apart = torch.arange(num_knots)[:, None] - torch.arange(num_knots)
+        self.register_buffer("shares", torch.exp(-0.5 * (apart / LEARNT_WITH) ** 2), persistent=False)
         self.homes: Tensor
         self.radii: Tensor
         self.searched: Tensor
+        self.shares: Tensor
         self._recall()
         self.register_load_state_dict_post_hook(lambda module, _: module._recall())
 
@@ -127,7 +135,8 @@ class CarriedBodies(nn.Module):
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Positions (..., 3) at times (...,) with the balls exchanged: bodies are at home."""
-        return self._exchanged(positions, times, self.tracks, range(self.num_bodies))
+        tracks = self._learnt_together() if self.training and self.tracks.requires_grad else self.tracks
+        return self._exchanged(positions, times, tracks, tracks, range(self.num_bodies))
 
     def inverse(self, positions: Tensor, times: Tensor) -> Tensor:
         """World positions (..., 3) at times (...,) of what `forward` gives.
@@ -135,7 +144,15 @@ class CarriedBodies(nn.Module):
         While a body is not there, this says where it may be: between its last place and its next one, or at the first
         or the last that is known.
         """
-        return self._exchanged(positions, times, self._filled(), reversed(range(self.num_bodies)))
+        return self._exchanged(positions, times, self.tracks, self._filled(), reversed(range(self.num_bodies)))
+
+    def _learnt_together(self) -> Tensor:
+        """Tracks as they are; a known knot's gradient goes to the known ones around it."""
+        is_known = ~self.is_nowhere(self.tracks)
+        shares = self.shares.to(self.tracks.dtype) * (is_known[:, :, None] & is_known[:, None])
+        known = torch.where(is_known[..., None], self.tracks, 0)
+        smooth = shares / shares.sum(-1, keepdim=True).clamp(min=1) @ known
+        return self.tracks.detach() + (smooth - smooth.detach())
 
     def _filled(self) -> Tensor:
         """Tracks without `NOWHERE`."""
@@ -151,12 +168,15 @@ class CarriedBodies(nn.Module):
             self.tracks[bodies, before.clamp(max=last)], self.tracks[bodies, after.clamp(0, last)], share[..., None]
         )
 
-    def _exchanged(self, positions: Tensor, times: Tensor, tracks: Tensor, numbers: Iterable[int]) -> Tensor:
-        """Positions with balls exchanged; what is at home goes to where `tracks` say."""
+    def _exchanged(
+        self, positions: Tensor, times: Tensor, tracks: Tensor, places: Tensor, numbers: Iterable[int]
+    ) -> Tensor:
+        """Positions with the balls around `tracks` exchanged; what is at home goes to where `places` say."""
         check_positions_times(positions, times)
         for number in numbers:
-            home, center = self.homes[number].to(positions.dtype), self.centers(number, times).to(positions.dtype)
-            place = center if tracks is self.tracks else self._along(tracks[number], times).to(positions.dtype)
+            home, center = self.homes[number].to(positions.dtype), self._along(tracks[number], times)
+            place = center if places is tracks else self._along(places[number], times)
+            center, place = center.to(positions.dtype), place.to(positions.dtype)
             with torch.no_grad():
                 is_there = ~self.is_nowhere(center)[..., None]  # no two bodies meet while they are not
                 is_away = ((positions - center).norm(dim=-1, keepdim=True) < self.radii[number]) & is_there

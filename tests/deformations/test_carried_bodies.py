@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dnerf.checkpoints import load_weights, save_weights
 from dnerf.deformations import CarriedBodies, CarriedDeformation, DisplacementDeformation, IdentityDeformation
-from dnerf.deformations.carried_bodies import NOWHERE
+from dnerf.deformations.carried_bodies import LEARNT_WITH, NOWHERE
 from dnerf.motion import carry, follow
 
 HOMES = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0]], dtype=torch.float64)
@@ -95,7 +95,7 @@ def test_tracks_are_straight_between_knots_and_exact_at_them() -> None:
 
 
 def test_gradients_of_tracks_and_positions() -> None:
-    bodies = two_bodies()
+    bodies = two_bodies().eval()
     times = torch.tensor([0.0, 0.33, 0.71, 1.0, 0.5], dtype=torch.float64)
     positions = bodies.centers(0, times).detach() + 0.1
     positions[-1] = 5.0
@@ -109,6 +109,29 @@ def test_gradients_of_tracks_and_positions() -> None:
     assert inputs[0].grad is not None
     assert (inputs[0].grad[0] != 0).any()
     assert (inputs[0].grad[2] == 0).all()  # there is no third body
+
+
+def test_knots_share_gradients_in_training_with_known_ones_only() -> None:
+    bodies = CarriedBodies(1, 41).double()
+    track = tracks(41)[0]
+    track[30:33] = NOWHERE
+    bodies.add(track, HOMES[0], 0.3)
+    times = torch.linspace(0, 1, 60, dtype=torch.float64)
+    positions = bodies.centers(0, times).detach() + 0.1
+    weights = torch.randn(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    gradients, moved = [], []
+    for mode in (False, True):
+        bodies.train(mode)
+        moved.append(bodies(positions, times))
+        gradients += torch.autograd.grad((weights * moved[-1]).sum(), [bodies.tracks])
+    assert torch.equal(*moved)
+    knots = torch.arange(41, dtype=torch.float64)
+    is_known = track[:, 0] < NOWHERE
+    shares = torch.exp(-0.5 * ((knots[:, None] - knots) / LEARNT_WITH) ** 2) * is_known * is_known[:, None]
+    shares = shares / shares.sum(1, keepdim=True).clamp(min=1)
+    torch.testing.assert_close(gradients[1][0], shares.T @ gradients[0][0])
+    assert (gradients[1][0][30:33] == 0).all()
+    assert (gradients[1][0][is_known] != 0).any(-1).all()
 
 
 def test_none_is_carried_until_one_is_added_and_weights_know_them(tmp_path: object) -> None:
