@@ -140,7 +140,7 @@ class BodySearch:
         return count > 0
 
     def _carry(self, tracks: Sequence[tuple[Tensor, float]], renderer: Renderer, bodies: CarriedBodies) -> int:
-        """Carry bodies of those tracks and radii, as far as homes are found; of how many they were.
+        """Carry bodies of those tracks and radii, as far as homes are found; how many those are.
 
         The deformation begins anew: what could not follow them has bent what lies around them.
         """
