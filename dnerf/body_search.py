@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 LAST = 0.9  # progress, after which what is found cannot be learnt any more
 ROOM = 1.6  # times a body's radius, in which it is carried
 BORDER = 0.02  # and so much more, in world units
-BESIDE = 0.5  # of the error from which a body is missing, if another one is
+ALSO_MISSING = 0.5  # of the error from which a body is missing, if another one is
 FAR = 0.3  # of the tolerance, from a body's path: a sighting that hardly counts
 CANDIDATES = 4096  # for a home
 TIMES = 16  # at which it has to be empty
@@ -174,7 +174,7 @@ class BodySearch:
         Source: thresholds of two heights (Canny 1986).
         """
         errors = [self._error_of(body, renderer, frames) for body in bodies]
-        least = self.missing * (BESIDE if max(errors, default=0.0) > self.missing else 1)
+        least = self.missing * (ALSO_MISSING if max(errors, default=0.0) > self.missing else 1)
         return [body for body, error in zip(bodies, errors, strict=True) if error > least]
 
     def _error_of(self, body: FastBody, renderer: Renderer, frames: Frames) -> float:

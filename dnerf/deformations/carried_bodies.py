@@ -135,7 +135,8 @@ class CarriedBodies(nn.Module):
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Positions (..., 3) at times (...,) with the balls exchanged: bodies are at home."""
-        tracks = self._learnt_together() if self.training and self.tracks.requires_grad else self.tracks
+        is_learning = self.training and self.tracks.requires_grad and torch.is_grad_enabled()
+        tracks = self._learnt_together() if is_learning else self.tracks
         return self._exchanged(positions, times, tracks, tracks, range(self.num_bodies))
 
     def inverse(self, positions: Tensor, times: Tensor) -> Tensor:
