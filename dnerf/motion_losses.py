@@ -94,32 +94,40 @@ class ElasticLoss(DeformationLoss):
     """Squared logarithm of how much the deformation stretches: matter should keep its lengths and must not fold.
 
     For a deformation D: `(log |D(x + h u, t) - D(x, t)| / h)^2`, u another unit direction at each point. It is zero
-    for rigid motion and grows towards a collapsed direction, which a map that folds has to pass through.
+    for rigid motion and grows towards a collapsed direction, which a map that folds has to pass through. With a
+    saturation it is robust: what lies between bodies that part, or where one meets another, may stretch at that price,
+    and what remains of each stays all the stiffer.
 
-    Source: the elastic regularisation of Nerfies (arXiv 2011.12948) eq. 6; deviation: the stretch along one direction
-    a point, from finite differences, instead of all singular values of the Jacobian.
+    Source: the elastic regularisation of Nerfies (arXiv 2011.12948) eq. 6, robust, as there, with `saturation`;
+    deviation: the stretch along one direction a point, from finite differences, instead of all singular values of the
+    Jacobian.
 
     Args:
         weight: factor of the term.
         num_points: see `DeformationLoss`.
         distance: of the differences, h, in world units.
+        saturation: price, before `weight`, that no point exceeds, see `saturated`; None for none.
 
     Raises:
-        ValueError: as `DeformationLoss`, and for a distance that is not positive.
+        ValueError: as `DeformationLoss`, and for a distance or a saturation that is not positive.
     """
 
-    def __init__(self, weight: float = 1e-3, num_points: int = 1024, *, distance: float = 0.02) -> None:
+    def __init__(
+        self, weight: float = 1e-3, num_points: int = 1024, *, distance: float = 0.02, saturation: float | None = None
+    ) -> None:
         super().__init__(weight, num_points)
         check_positive("distance", distance)
+        check_saturation(saturation)
         self.distance = distance
+        self.saturation = saturation
 
     def penalty(self, deformation: Deformation, points: MotionPoints) -> Tensor:
-        """Squared logarithm of the stretch; of a collapsed direction as of a hundredth of its length."""
+        """Squared logarithm of the stretch, saturated; of a collapsed direction as of a hundredth of its length."""
         steps = self.distance * spread_directions(points.positions)
         ends = torch.cat([points.positions, points.positions + steps])
         here, there = deformation(ends, points.times.repeat(2)).chunk(2)
         squared = ((there - here) / self.distance).square().sum(-1)
-        return (0.5 * torch.log(squared + LEAST_STRETCH**2)).square()
+        return saturated((0.5 * torch.log(squared + LEAST_STRETCH**2)).square(), self.saturation)
 
 
 class VolumeLoss(DeformationLoss):
@@ -137,23 +145,32 @@ class VolumeLoss(DeformationLoss):
         num_points: see `DeformationLoss`.
         distance: of the forward differences, in world units.
         least: determinant below which the logarithm goes on as its tangent.
+        saturation: price, before `weight`, that no point exceeds, see `saturated`; None for none.
 
     Raises:
-        ValueError: as `DeformationLoss`, and for a distance or a least determinant that is not positive.
+        ValueError: as `DeformationLoss`, and for a distance, a least determinant or a saturation that is not positive.
     """
 
     def __init__(
-        self, weight: float = 3e-3, num_points: int = 256, *, distance: float = 0.02, least: float = 0.1
+        self,
+        weight: float = 3e-3,
+        num_points: int = 256,
+        *,
+        distance: float = 0.02,
+        least: float = 0.1,
+        saturation: float | None = None,
     ) -> None:
         super().__init__(weight, num_points)
         check_positive("distance", distance)
         check_positive("least", least)
+        check_saturation(saturation)
         self.distance = distance
         self.least = least
+        self.saturation = saturation
 
     def penalty(self, deformation: Deformation, points: MotionPoints) -> Tensor:
-        """Squared logarithm of the determinant."""
-        return self.logarithms(deformation, points).square()
+        """Squared logarithm of the determinant, saturated."""
+        return saturated(self.logarithms(deformation, points).square(), self.saturation)
 
     def logarithms(self, deformation: Deformation, points: MotionPoints) -> Tensor:
         """Logarithm of the determinant (M,), of finite differences along the three axes; below `least` its tangent."""
@@ -245,6 +262,20 @@ class SteadyMatterLoss(DeformationLoss):
         super()._subject(renderer)
         assert isinstance(renderer.field, DeformedField)
         return renderer.field.canonical
+
+
+def saturated(prices: Tensor, saturation: float | None) -> Tensor:
+    """Prices p >= 0 that come no higher than s: p / (1 + p / s), of any shape; None leaves them as they are.
+
+    Of squares this is the Geman-McClure penalty, up to a factor: what is far off is let go, not pulled at the hardest.
+    """
+    return prices if saturation is None else prices / (1 + prices / saturation)
+
+
+def check_saturation(saturation: float | None) -> None:
+    """Refuse a saturation that is not positive."""
+    if saturation is not None:
+        check_positive("saturation", saturation)
 
 
 def spread_directions(like: Tensor) -> Tensor:

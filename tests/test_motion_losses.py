@@ -114,9 +114,14 @@ class Linear(Deformation):
         return positions @ self.matrix.to(positions.dtype).mT
 
 
-def elastic(matrix: Tensor, count: int = 4000, weight: float = 1.0) -> Tensor:
+def elastic(matrix: Tensor, count: int = 4000, weight: float = 1.0, **settings: float) -> Tensor:
     renderer = Renderer(DeformedField(Linear(matrix), make_scene("static")), StratifiedSampler(4))
-    return ElasticLoss(weight, count)(rendering(count), torch.zeros(8, 3), renderer)
+    return ElasticLoss(weight, count, **settings)(rendering(count), torch.zeros(8, 3), renderer)
+
+
+def volume(matrix: Tensor, kind: type[VolumeLoss] = VolumeLoss, **settings: float) -> Tensor:
+    renderer = Renderer(DeformedField(Linear(matrix), make_scene("static")), StratifiedSampler(4))
+    return kind(1.0, **settings)(rendering(), torch.zeros(8, 3), renderer)
 
 
 def test_rigid_motion_is_not_elastic() -> None:
@@ -139,6 +144,29 @@ def test_uneven_stretch_costs_the_mean_over_all_directions() -> None:
     assert elastic(matrix).item() == pytest.approx(expected, rel=0.05)  # shares of 4000 points are random
 
 
+@pytest.mark.parametrize(("cost", "power"), [(elastic, 1), (volume, 3)])
+@given(logarithm=st.floats(-0.7, 1.2), saturation=st.sampled_from([1e-3, 0.04, 1.0]))
+def test_saturated_prices_are_those_of_geman_and_mcclure(cost, power: int, logarithm: float, saturation: float) -> None:
+    """An even stretch: its logarithm, three times that of a volume, x; the price is s x^2 / (s + x^2), below s."""
+    square = (power * logarithm) ** 2
+    found = cost(math.exp(logarithm) * torch.eye(3, dtype=torch.float64), saturation=saturation).item()
+    assert found == pytest.approx(saturation * square / (saturation + square), rel=0.02, abs=1e-4 * saturation)
+    assert found <= saturation
+
+
+def test_what_is_far_off_is_let_go() -> None:
+    """The saturated price pulls hardest at the third of its saturation, the plain one ever harder."""
+    pulls = {}
+    for saturation in (None, 0.04):
+        for stretch in (1.12, 1.5, 2.0):
+            deformation = Linear(stretch * torch.eye(3, dtype=torch.float64))
+            renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
+            ElasticLoss(1.0, saturation=saturation)(rendering(), torch.zeros(8, 3), renderer).backward()
+            pulls[saturation, stretch] = deformation.matrix.grad.norm().item()
+    assert pulls[None, 1.12] < pulls[None, 1.5] < pulls[None, 2.0]
+    assert pulls[0.04, 1.12] > 2 * pulls[0.04, 1.5] > 4 * pulls[0.04, 2.0]
+
+
 def test_collapse_costs_much_and_is_pushed_open() -> None:
     deformation = Linear(torch.diag(torch.tensor([1.0, 1.0, 0.05], dtype=torch.float64)))
     renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
@@ -153,11 +181,6 @@ def test_gradient_is_finite_where_all_is_collapsed() -> None:
     renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
     ElasticLoss(1.0)(rendering(dtype=torch.float32), torch.zeros(8, 3), renderer).backward()
     assert torch.isfinite(deformation.matrix.grad).all()
-
-
-def volume(matrix: Tensor, kind: type[VolumeLoss] = VolumeLoss, **settings: float) -> Tensor:
-    renderer = Renderer(DeformedField(Linear(matrix), make_scene("static")), StratifiedSampler(4))
-    return kind(1.0, **settings)(rendering(), torch.zeros(8, 3), renderer)
 
 
 def test_what_keeps_volumes_costs_nothing() -> None:
@@ -385,6 +408,8 @@ def test_a_field_without_deformation_is_named() -> None:
         (lambda: ElasticLoss(distance=0.0), "distance must be > 0"),
         (lambda: VolumeLoss(distance=0.0), "distance must be > 0"),
         (lambda: VolumeLoss(least=-1.0), "least must be > 0"),
+        (lambda: VolumeLoss(saturation=0.0), "saturation must be > 0"),
+        (lambda: ElasticLoss(saturation=-0.1), "saturation must be > 0"),
         (lambda: FoldingLoss(distance=-0.1), "distance must be > 0"),
         (lambda: FoldingLoss(limit=1.5), r"limit must be in \[least, 1\] = \[0.1, 1\], got 1.5"),
         (lambda: FoldingLoss(limit=0.05), r"limit must be in \[least, 1\] = \[0.1, 1\], got 0.05"),
