@@ -18,6 +18,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
     The temporary file keeps the suffix of `path`; it is flushed to the disk before it is renamed, and the folder
     after, so that the new file survives a power cut. A process killed in between leaves the old file as it was, and
     a temporary one that `remove_leftovers` finds.
+
+    Raises:
+        OSError: what the block and the system raise; it names `path` where it named no file (a full disk's does not).
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -28,6 +31,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         _flush(temporary)
         temporary.replace(path)
         _flush(path.parent)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -31,6 +31,18 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "state.bin"
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*state\.bin'"),
+        atomic_path(path),
+        Path("/dev/full").open("wb", buffering=0) as full,
+    ):
+        full.write(b"0")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_old_file_is_seen_until_the_new_one_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "file.txt"
     path.write_text("old")
