@@ -95,8 +95,7 @@ class ElasticLoss(DeformationLoss):
 
     For a deformation D: `(log |D(x + h u, t) - D(x, t)| / h)^2`, u another unit direction at each point. It is zero
     for rigid motion and grows towards a collapsed direction, which a map that folds has to pass through. With a
-    saturation it is robust: what lies between bodies that part, or where one meets another, may stretch at that price,
-    and what remains of each stays all the stiffer.
+    saturation it is robust: what lies between bodies that part, or where one meets another, may stretch at that price.
 
     Source: the elastic regularisation of Nerfies (arXiv 2011.12948) eq. 6, robust, as there, with `saturation`;
     deviation: the stretch along one direction a point, from finite differences, instead of all singular values of the
