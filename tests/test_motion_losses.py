@@ -155,15 +155,16 @@ def test_saturated_prices_are_those_of_geman_and_mcclure(cost, power: int, logar
 
 
 def test_what_is_far_off_is_let_go() -> None:
-    """The saturated price pulls hardest at the third of its saturation, the plain one ever harder."""
+    """Saturated, it pulls hardest at the third of its saturation, else the harder the further (up to a stretch of e)."""
     pulls = {}
     for saturation in (None, 0.04):
-        for stretch in (1.12, 1.5, 2.0):
+        for stretch in (1.02, 1.12, 1.5, 2.0):
             deformation = Linear(stretch * torch.eye(3, dtype=torch.float64))
             renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
             ElasticLoss(1.0, saturation=saturation)(rendering(), torch.zeros(8, 3), renderer).backward()
             pulls[saturation, stretch] = deformation.matrix.grad.norm().item()
-    assert pulls[None, 1.12] < pulls[None, 1.5] < pulls[None, 2.0]
+    assert pulls[None, 1.02] < pulls[None, 1.12] < pulls[None, 1.5]
+    assert pulls[0.04, 1.12] > 2 * pulls[0.04, 1.02]
     assert pulls[0.04, 1.12] > 2 * pulls[0.04, 1.5] > 4 * pulls[0.04, 2.0]
 
 
