@@ -155,7 +155,7 @@ def test_saturated_prices_are_those_of_geman_and_mcclure(cost, power: int, logar
 
 
 def test_what_is_far_off_is_let_go() -> None:
-    """Saturated, it pulls hardest at the third of its saturation, else the harder the further (up to a stretch of e)."""
+    """The saturated price pulls hardest at the third of its saturation, the plain one harder up to a stretch of e."""
     pulls = {}
     for saturation in (None, 0.04):
         for stretch in (1.02, 1.12, 1.5, 2.0):
