@@ -226,7 +226,7 @@ def shows_outside(frames: Frames, box: Tensor) -> bool:
         rows, columns = (frames.images[index, ::EVERY_PIXEL, ::EVERY_PIXEL, 3] >= 128).nonzero().unbind(-1)
         rays = frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * frames.intrinsics.width + columns))
         enter, leave = ray_box(rays.origins, rays.directions, box)
-        if bool((enter > leave).any()):
+        if bool(((enter > leave) | (leave < rays.near) | (enter > rays.far)).any()):
             return True
     return False
 

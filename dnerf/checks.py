@@ -44,6 +44,17 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
         raise ValueError(f"{name} must be {bound} and finite, got {value}")
 
 
+def check_whole(name: str, value: float, *, allow_zero: bool = False) -> None:
+    """Raise unless a number is positive (or zero where allowed), finite and whole.
+
+    Raises:
+        ValueError: naming the argument and its value.
+    """
+    check_positive(name, value, allow_zero=allow_zero)
+    if int(value) != value:
+        raise ValueError(f"{name} must be a whole number, got {value}")
+
+
 def check_mapping(name: str, values: object, *, allow_zero: bool = False) -> None:
     """Raise unless `values` holds positive (or, where allowed, zero) finite numbers by name.
 

@@ -211,11 +211,15 @@ def median_depth(rendering: Rendering) -> Tensor:
         offsets = samples.offsets
     else:
         offsets = weights.shape[-1] * torch.arange(samples.num_rays + 1, device=weights.device)
-    flat = weights.reshape(-1).double()
+    # Shares of what each ray absorbs: faint rays are as exact as others, and one that is no number spoils no other.
+    totals = sum_along_rays(weights.double(), samples)
+    shares = weights.double() / samples.per_sample(totals)
+    flat = torch.where(samples.per_sample(totals.isfinite() & (totals > 0)), shares, 0).reshape(-1)
     absorbed = torch.nn.functional.pad(flat.cumsum(0), (1, 0))
     begin, end = absorbed[offsets[:-1]], absorbed[offsets[1:]]
     halves = 0.5 * (begin + end)
     reached = torch.searchsorted(absorbed, halves).sub(1).clamp(min=0, max=count - 1)  # absorbed[k] < half <= [k + 1]
     share = ((halves - absorbed[reached]) / flat[reached].clamp(min=torch.finfo(flat.dtype).tiny)).clamp(0, 1)
     starts, ends = (x.reshape(-1)[reached].double() for x in (samples.starts, samples.ends))
-    return torch.where(end > begin, torch.lerp(starts, ends, share), 0).to(rendering.depth.dtype)
+    depth = torch.where(end > begin, torch.lerp(starts, ends, share), 0)
+    return torch.where(totals.isfinite(), depth, torch.nan).to(rendering.depth.dtype)

@@ -54,16 +54,18 @@ class PhotometricLoss(Loss):
         self.delta = delta
         self.proposal_weight = proposal_weight
 
-    def _error(self, rgb: Tensor, target: Tensor) -> Tensor:
+    def _error(self, rendering: Rendering, target: Tensor) -> Tensor:
         if self.kind == "mse":
-            return nn.functional.mse_loss(rgb, target)
-        return 2 * nn.functional.huber_loss(rgb, target, delta=self.delta)
+            errors = nn.functional.mse_loss(rendering.rgb, target, reduction="none")
+        else:
+            errors = 2 * nn.functional.huber_loss(rendering.rgb, target, delta=self.delta, reduction="none")
+        return rendering.mean(errors.mean(-1))
 
     def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
         """Error of the picture plus the weighted errors of its proposals' pictures."""
-        loss = self._error(rendering.rgb, target)
+        loss = self._error(rendering, target)
         for proposal in rendering.proposals:
-            loss = loss + self.proposal_weight * self._error(proposal.rgb, target)
+            loss = loss + self.proposal_weight * self._error(proposal, target)
         return loss
 
 
@@ -125,7 +127,7 @@ class OpacityEntropyLoss(Loss):
         """Weighted mean of -o log o - (1 - o) log(1 - o); o is kept 1e-4 from 0 and 1, so that gradients are finite."""
         opacity = rendering.opacity.clamp(1e-4, 1 - 1e-4)
         entropy = -(opacity * torch.log(opacity) + (1 - opacity) * torch.log1p(-opacity))
-        return self.weight * entropy.mean()
+        return self.weight * rendering.mean(entropy)
 
 
 class HiddenMatterLoss(Loss):

@@ -57,7 +57,8 @@ def carry(
     Returns:
         moved: (..., 3) where they are at `end`.
         residual: (...,) distance in canonical space between the points and their images, in world units: how well the
-            inverse fits. Zero for analytic scenes; a large one (no inverse was found) means that `moved` is no answer.
+            inverse fits. Zero for analytic scenes; a large one (no inverse was found) means that `moved` is no answer,
+            infinity that no matter is there: the home of a carried body that is absent.
 
     Raises:
         ValueError: for shapes that do not fit.
@@ -73,7 +74,9 @@ def carry(
             home = model.bodies(positions, before)
             near = None if guess is None else model.bodies(guess, after)
             moved, residual = carry(model.deformation, home, before, after, guess=near)
-            return model.bodies.inverse(moved, after), residual
+            is_nowhere = model.bodies.is_nowhere(home)
+            moved = torch.where(is_nowhere[..., None], positions, model.bodies.inverse(moved, after))
+            return moved, residual.masked_fill(is_nowhere, torch.inf)
         canonical = model(positions, before)
         if not isinstance(model, InvertibleDeformation):
             guess = positions if guess is None else guess

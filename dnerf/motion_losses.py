@@ -8,6 +8,7 @@ have, see `dnerf.flow_losses`.
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from dnerf.losses import Loss
 from dnerf.renderer import Renderer
 
 LEAST_STRETCH = 0.01
+GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
@@ -80,12 +82,12 @@ class DeformationLoss(Loss):
         assert rendering.output is not None
         assert rendering.weights is not None
         extras = rendering.output.extras
-        every = max(1, -(-extras["times"].numel() // self.num_points))
-        weights = rendering.weights.detach().reshape(-1)[::every]
+        chosen = spread_numbers(extras["times"].shape, self.num_points, extras["times"].device)
+        weights = rendering.weights.detach().reshape(-1)[chosen]
         return MotionPoints(
-            positions=extras.get("carried_positions", extras["positions"]).detach().reshape(-1, 3)[::every],
-            canonical=extras["canonical_positions"].detach().reshape(-1, 3)[::every],
-            times=extras["times"].reshape(-1)[::every],
+            positions=extras.get("carried_positions", extras["positions"]).detach().reshape(-1, 3)[chosen],
+            canonical=extras["canonical_positions"].detach().reshape(-1, 3)[chosen],
+            times=extras["times"].reshape(-1)[chosen],
             shares=weights / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny),
         )
 
@@ -261,6 +263,19 @@ class SteadyMatterLoss(DeformationLoss):
         super()._subject(renderer)
         assert isinstance(renderer.field, DeformedField)
         return renderer.field.canonical
+
+
+def spread_numbers(shape: Sequence[int], most: int, device: torch.device) -> Tensor | slice:
+    """At most so many numbers of samples of a layout (N,) or (R, S), evenly spread over it.
+
+    Dense rays have equally many samples: numbers at equal distances might all be of their first ones, near the camera.
+    """
+    count = math.prod(shape)
+    every = max(1, -(-count // most))
+    if len(shape) == 1 or every == 1:
+        return slice(None, None, every)
+    numbers = torch.arange(count // every, device=device)
+    return numbers * every + ((numbers.double() * GOLDEN_RATIO) % 1 * every).long()
 
 
 def saturated(prices: Tensor, saturation: float | None) -> Tensor:

@@ -149,12 +149,14 @@ class MotionSearch:
             space-time volumes have joined, or pictures show nothing.
 
         Raises:
-            ValueError: for a field without a place for what is found.
+            ValueError: for a field without a place for what is found, or a flow whose clock is not running.
         """
         field = renderer.field
         flow = field.motion_flow if isinstance(field, DeformedField) else None
         if not isinstance(field, DeformedField) or flow is None:
             raise ValueError("a motion search needs a DeformedField with a motion_flow, this field has none")
+        if flow.clock != "running":
+            raise ValueError(f"motion_flow.clock must be running, points are carried so, got {flow.clock}")
         if not _remembers(field):
             return None
         generator = torch.Generator(renderer.device).manual_seed(seed)
@@ -165,7 +167,7 @@ class MotionSearch:
             if not len(seen.times):
                 return None
             carried = partial(self._carried, flow, field.bodies)
-            self._fit(flow, carried, contents, seen, generator, progress_bar=progress_bar)
+            self._fit(flow, field.bodies, carried, contents, seen, generator, progress_bar=progress_bar)
             found = self._judged(field.modelled_motion, carried, contents, seen, generator)
         field.set_found_motion(found.is_motion)
         if not found.is_motion:
@@ -175,6 +177,7 @@ class MotionSearch:
     def _fit(
         self,
         flow: FlowDeformation,
+        bodies: CarriedBodies | None,
         carried: Carried,
         contents: Contents,
         seen: SeenMatter,
@@ -198,10 +201,12 @@ class MotionSearch:
                 before = contents(positions, times)
             moved = carried(positions, times, ends, span)
             change = (contents(moved, ends) - before).square().sum(-1).mean()
-            speed = flow.velocity(positions, times).square().sum(-1).mean()
+            behind = positions if bodies is None else bodies(positions, times)
+            speed = flow.velocity(behind, times).square().sum(-1).mean()
             optimizer.zero_grad(set_to_none=True)
             (change + self.still_weight * speed).backward()
             optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
 
     def _drawn(self, seen: SeenMatter, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Positions (count, 3) at or near seen matter, and their times (count,)."""

@@ -100,8 +100,9 @@ def _after(values: Tensor) -> Tensor:
 def _touches_next(samples: Samples) -> Tensor:
     """Whether an interval is followed by another of its ray without a gap, and by another point; like samples."""
     next_start, shorter = _after(samples.starts), torch.minimum(samples.lengths, _after(samples.lengths))
-    gap = (next_start - samples.ends).abs() <= TOUCHING * shorter
-    touches = gap & (_after(samples.distances) > samples.distances)
+    joined = (next_start - samples.ends).abs() <= TOUCHING * shorter
+    # What has no length, padding above all, is no neighbour.
+    touches = joined & (shorter > 0) & (_after(samples.distances) > samples.distances)
     touches[..., -1:] = False
     if samples.ray_indices is not None:
         touches[:-1] &= samples.ray_indices[1:] == samples.ray_indices[:-1]

@@ -182,5 +182,5 @@ def rays_that_fit(num_rays: int, fullness: float, most: int) -> int:
     """How many rays to take next, of which so many filled that share of their fixed places."""
     if FULL[0] <= fullness <= FULL[1]:
         return num_rays
-    wanted = num_rays * min(max(AIM / max(fullness, 1e-3), 0.25), 4)
-    return max(min(int(wanted), most) // ROUND_TO * ROUND_TO, ROUND_TO)
+    wanted = max(int(min(num_rays * min(max(AIM / max(fullness, 1e-3), 0.25), 4), most)), 1)
+    return wanted // ROUND_TO * ROUND_TO if wanted >= ROUND_TO else 1 << (wanted.bit_length() - 1)

@@ -92,7 +92,8 @@ class TimeWindow:
         if num_frames == len(times):
             return None
         nearest, distances = self._from_origin(times)
-        return nearest[: bisect_right(distances, distances[num_frames - 1] + SAME_TIME)]
+        num_frames = bisect_right(distances, distances[num_frames - 1] + SAME_TIME)
+        return None if num_frames == len(times) else nearest[:num_frames]
 
     def _from_origin(self, times: Tensor) -> tuple[Tensor, list[float]]:
         """Frames from the origin outwards, and how far they are; asked once for one tensor of times."""

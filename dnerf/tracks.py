@@ -2,6 +2,7 @@
 
 import colorsys
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -59,7 +60,8 @@ def draw_tracks(
 
     Args:
         image: (H, W, 3) float in [0, 1] or uint8.
-        pixels: (T, P, 2) columns and rows of P points at T times, the last one now; whole numbers are pixel centres.
+        pixels: (T, P, 2) columns and rows of P points at T >= 1 times, the last one now; whole numbers are pixel
+            centres, and trails are drawn where two in a row are finite.
         visible: (P,) bool, whether a point is seen now; the others are left out.
         colors: P colours, 0 to 255.
         width: of the trails, in pixels.
@@ -71,6 +73,8 @@ def draw_tracks(
         ValueError: for shapes that do not fit.
     """
     check_shape("pixels", pixels, ("T", "P", 2))
+    if not len(pixels):
+        raise ValueError("pixels must be of one time at least, got none")
     check_shape("visible", visible, (pixels.shape[1],))
     if len(colors) != pixels.shape[1]:
         raise ValueError(f"colors must be {pixels.shape[1]}, one per point, got {len(colors)}")
@@ -81,9 +85,11 @@ def draw_tracks(
     line, radius = max(1, round(width * SUPERSAMPLING)), 1.2 * width * SUPERSAMPLING
     trails = ((pixels.cpu().double() + 0.5) * SUPERSAMPLING).transpose(0, 1)
     for trail, shown, color in zip(trails.tolist(), visible.tolist(), colors):
-        if not shown or not np.isfinite(trail).all():
+        if not shown or not np.isfinite(trail[-1]).all():
             continue
-        draw.line([(x, y) for x, y in trail], fill=color, width=line, joint="curve")
+        for is_known, places in groupby(trail, key=lambda place: bool(np.isfinite(place).all())):
+            if is_known:
+                draw.line([(x, y) for x, y in places], fill=color, width=line, joint="curve")
         x, y = trail[-1]
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=color)
     return torch.from_numpy(np.array(picture.resize(size, Image.Resampling.LANCZOS)))
@@ -91,6 +97,8 @@ def draw_tracks(
 
 def track_colors(points: Tensor) -> list[tuple[int, int, int]]:
     """A colour for each of P points (P, 3), its hue by height and its lightness by side."""
+    if not len(points):
+        return []
     low, high = points.amin(0), points.amax(0)
     unit = ((points - low) / (high - low).clamp(min=1e-6)).tolist()
     return [
@@ -131,13 +139,14 @@ def render_tracks(
     moments = torch.tensor(list(times), dtype=points.dtype, device=points.device)
     tracks = follow(motion_model(renderer), points, time, moments)
     pixels, depths = camera.project(tracks.positions)
+    pixels = torch.where(depths[..., None] > 0, pixels, torch.nan)  # behind the camera is no place in the picture
     colors = track_colors(points)
 
     def pictures() -> Iterator[Tensor]:
         size = torch.tensor([camera.intrinsics.width, camera.intrinsics.height], device=points.device)
         for i in range((len(times) - 1) % every, len(times), every):
             rendering = renderer.render_image(camera, float(times[i]), chunk=chunk)
-            nearest = torch.where(depths[i, :, None] > 0, pixels[i], -1.0).round().long()
+            nearest = pixels[i].nan_to_num(nan=-1.0).round().long()
             inside = ((nearest >= 0) & (nearest < size)).all(-1)
             columns, rows = torch.where(inside[:, None], nearest, 0).unbind(-1)
             distance = (tracks.positions[i] - camera.pose[:3, 3]).norm(dim=-1)

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from dnerf.backgrounds import RandomBackground
 from dnerf.body_search import BodySearch
 from dnerf.box_check import BoxCheck
-from dnerf.checks import check_choice, check_mapping, check_positive
+from dnerf.checks import check_choice, check_mapping, check_positive, check_whole
 from dnerf.data.frames import Frames
 from dnerf.distributed import Processes
 from dnerf.encodings import TimeEncoding
@@ -115,16 +115,20 @@ class Trainer:
     ) -> None:
         check_mapping("learning_rates", learning_rates or {}, allow_zero=True)
         check_mapping("loss_every", loss_every or {})
-        for name, value in (
-            ("num_rays", num_rays), ("max_rays", max_rays),
-            ("final_learning_rate", final_learning_rate), ("marched_per_sample", marched_per_sample),
-            ("target_samples", 1 if target_samples is None else target_samples),
-        ):  # fmt: skip
-            check_positive(name, value)
+        target = 1 if target_samples is None else target_samples
+        for name, value in (("num_rays", num_rays), ("max_rays", max_rays), ("target_samples", target)):
+            check_whole(name, value)
+        check_whole("warmup_steps", warmup_steps, allow_zero=True)
+        check_positive("final_learning_rate", final_learning_rate)
+        check_positive("marched_per_sample", marched_per_sample)
+        check_positive("epsilon", epsilon, allow_zero=True)
+        if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
+            raise ValueError(f"betas must be two numbers in [0, 1), got {betas!r}")
+        if isinstance(orthogonal, str):
+            raise ValueError(f"orthogonal must be a list of names' beginnings, got {orthogonal!r}")
         check_choice("schedule", schedule, SCHEDULES)
         for name, every in (loss_every or {}).items():
-            if int(every) != every:
-                raise ValueError(f"loss_every.{name} must be a whole number of steps, got {every}")
+            check_whole(f"loss_every.{name}", every)
         kinds = (
             ("time_window", time_window, TimeWindow),
             ("error_map", error_map, ErrorMap),
@@ -187,14 +191,15 @@ class Trainer:
             checkpoints: where states are written every `checkpoint_every` steps and at the end, or None.
             resume: continue from the newest checkpoint, if there is one, exactly as if training had never stopped.
             processes: those that train together; None for this one alone.
-            seconds: of `max_seconds` that were spent before the first step; a checkpoint knows its own.
+            seconds: of `max_seconds`, less than it, that were spent before the first step; a checkpoint knows its own.
 
         Returns:
             The last step's record.
 
         Raises:
             FloatingPointError: naming step and tensors, when the loss is not finite.
-            ValueError: if frames have no alpha but a random background needs it, or a checkpoint does not fit.
+            ValueError: if frames have no alpha but a random background needs it, no second is left, or a checkpoint
+                does not fit.
             TrainingStopped: after a signal.
             BoxTooLarge: if `box_check` finds so; the model is of no more use, and neither are its checkpoints.
             MemoryError: saying what to lower, when a GPU's memory does not suffice.
@@ -202,6 +207,8 @@ class Trainer:
         """
         if isinstance(renderer.background, RandomBackground) and not frames.has_alpha:
             raise ValueError("background: a random one needs frames with alpha, these have none")
+        if self.limits.max_seconds is not None and not 0 <= seconds < self.limits.max_seconds:
+            raise ValueError(f"seconds must be in [0, max_seconds) = [0, {self.limits.max_seconds}), got {seconds}")
         processes = processes or Processes()
         frames = frames.to(renderer.device)
         generator = torch.Generator(renderer.device).manual_seed(seed)

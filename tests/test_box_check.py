@@ -224,6 +224,10 @@ def test_an_opaque_pixel_looks_past_a_box_or_into_it() -> None:
     cube = torch.tensor([[-0.5] * 3, [0.5] * 3])
     assert not shows_outside(with_opaque(2, 3, 3), cube)
     assert shows_outside(with_opaque(2, 3, 3), cube + 3)
+    behind = with_opaque(2, 3, 3).poses[2, :3, 3] * 3  # the box's other side of the camera
+    assert shows_outside(with_opaque(2, 3, 3), cube + behind)
+    beyond = replace(with_opaque(2, 3, 3), near=0.5, far=1.0)
+    assert shows_outside(beyond, cube)
     assert not shows_outside(views(), cube + 3)  # no alpha
 
 

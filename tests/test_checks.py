@@ -6,7 +6,7 @@ import re
 import pytest
 import torch
 
-from dnerf.checks import as_box, check_batch, check_choice, check_positive, check_shape
+from dnerf.checks import as_box, check_batch, check_choice, check_positive, check_shape, check_whole
 
 
 @pytest.mark.parametrize(
@@ -41,6 +41,14 @@ def test_batch_of_positions_is_expected() -> None:
 def test_numbers_that_are_not_positive_and_finite_are_refused(value: float) -> None:
     with pytest.raises(ValueError, match=rf"radius must be > 0 and finite, got {value}"):
         check_positive("radius", value)
+
+
+@pytest.mark.parametrize(("value", "expected"), [(0.5, "a whole number"), (1e-9, "a whole number"), (-1, ">= 0")])
+def test_numbers_that_are_not_whole_are_refused(value: float, expected: str) -> None:
+    check_whole("steps", 0, allow_zero=True)
+    check_whole("steps", 3.0)
+    with pytest.raises(ValueError, match=f"steps must be {expected}.*got {value}"):
+        check_whole("steps", value, allow_zero=True)
 
 
 @pytest.mark.parametrize("value", ["abc", None, [1.0], {}])

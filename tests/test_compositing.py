@@ -488,6 +488,20 @@ def test_median_depth_of_vacuum_is_zero(layout: str) -> None:
     assert median_depth(composite(nothing, FieldOutput(torch.zeros(0), torch.zeros(0, 3)))).tolist() == [0.0, 0.0]
 
 
+@both_layouts
+def test_median_depth_of_faint_and_broken_rays_is_their_own(layout: str) -> None:
+    """A ray that absorbs next to nothing is as exact behind twenty thousand opaque ones, and NaN stays where it is."""
+    density = torch.full((20_002, 4), 50.0, dtype=torch.float64)
+    density[0] = torch.nan
+    density[-1] = torch.tensor([0, 1e-12, 0, 0])
+    found = median_depth(render(layout, uniform(0, 2, 4, num_rays=len(density)), density))
+    assert bool(found[0].isnan())
+    expected = math.log(2 / (1 + math.exp(-100))) / 50  # the closed form; within a sample light is absorbed evenly
+    torch.testing.assert_close(found[1:-1], torch.full_like(found[1:-1], found[1]), rtol=0, atol=1e-9)
+    assert abs(float(found[1]) - expected) < 0.5
+    assert float(found[-1]) == pytest.approx(0.75, abs=1e-9)
+
+
 def test_median_depth_of_a_whole_image_is_refused() -> None:
     with pytest.raises(ValueError, match="rendering must have per-sample data"):
         median_depth(Rendering(rgb=torch.zeros(2, 3), opacity=torch.zeros(2), depth=torch.zeros(2)))

@@ -1,6 +1,7 @@
 """Losses against their formulas."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,11 +14,13 @@ from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolum
 from dnerf.losses import (
     FadingLoss,
     HiddenMatterLoss,
+    Loss,
     OpacityEntropyLoss,
     PhotometricLoss,
     SmoothKnotsLoss,
     SmoothVolumesLoss,
 )
+from dnerf.rays import Samples
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler, StratifiedSampler
 
@@ -33,6 +36,17 @@ def test_squared_error_is_the_mean_over_rays_and_channels() -> None:
     rgb, target = torch.rand(10, 3), torch.rand(10, 3)
     expected = sum((a - b) ** 2 for a, b in zip(rgb.flatten().tolist(), target.flatten().tolist())) / 30
     assert PhotometricLoss()(picture(rgb), target, RENDERER).item() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", [PhotometricLoss(), PhotometricLoss("huber"), OpacityEntropyLoss(1.0)])
+def test_rays_that_found_no_places_count_for_nothing(loss: Loss) -> None:
+    rgb, opacity, target = torch.rand(6, 3), torch.rand(6), torch.rand(6, 3)
+    placed = torch.tensor([True, True, False, True, False, False])
+    nothing = torch.zeros(0)
+    samples = Samples(nothing, nothing, 6, ray_indices=nothing.long(), is_placed=placed)
+    shown = replace(picture(rgb, opacity), samples=samples)
+    expected = loss(picture(rgb[placed], opacity[placed]), target[placed], RENDERER)
+    torch.testing.assert_close(loss(shown, target, RENDERER), expected)
 
 
 def test_huber_error_is_quadratic_then_linear() -> None:

@@ -383,6 +383,22 @@ def test_points_are_spread_over_the_batch_and_bounded(name: str) -> None:
     assert points.shares.sum().item() == pytest.approx(1)
 
 
+@pytest.mark.parametrize(("num_rays", "num_samples"), [(1024, 64), (2048, 64), (1024, 192), (1000, 64), (512, 16)])
+def test_points_of_dense_rays_are_of_all_distances(num_rays: int, num_samples: int) -> None:
+    """Whatever divides what: equal steps over (R, S) samples might meet each ray at its first one only."""
+    shape = (num_rays, num_samples)
+    positions = torch.arange(num_samples).expand(shape)[..., None].expand(*shape, 3).double()
+    extras = {"positions": positions, "times": torch.zeros(shape), "canonical_positions": positions}
+    output = FieldOutput(torch.ones(shape), torch.ones(*shape, 3), extras)
+    nothing = torch.zeros(num_rays)
+    picture = Rendering(torch.zeros(num_rays, 3), nothing, nothing, weights=torch.ones(shape), output=output)
+    points = ElasticLoss(1.0, 1024)._points(picture)
+    assert 512 < len(points.times) <= 1024
+    counts = points.positions[:, 0].long().bincount(minlength=num_samples).double()
+    assert counts.min() > 0.3 * counts.mean()
+    assert counts.max() < 2 * counts.mean()
+
+
 @every_loss
 def test_an_empty_picture_costs_nothing(name: str) -> None:
     picture = rendering()

@@ -262,3 +262,16 @@ def test_a_field_without_a_place_for_motion_is_refused(frames: Frames) -> None:
     renderer = Renderer(DeformedField(IdentityDeformation(), Balls(going)), StratifiedSampler(8))
     with pytest.raises(ValueError, match="needs a DeformedField with a motion_flow, this field has none"):
         a_search()(renderer, frames)
+
+
+def test_nothing_is_left_of_the_gradients(found: tuple[Renderer, FoundMotion, dict[str, Tensor]]) -> None:
+    assert all(parameter.grad is None for parameter in found[0].parameters())
+
+
+def test_a_flow_with_a_frozen_clock_is_refused(frames: Frames) -> None:
+    """Points are carried by the equation of a running clock, which is not the motion that such a flow would give."""
+    renderer = a_renderer(going)
+    velocity = renderer.field.motion_flow.velocity
+    renderer.field.motion_flow = FlowDeformation(velocity, 0.5, clock="frozen", solver="midpoint", num_steps=10)
+    with pytest.raises(ValueError, match=r"motion_flow\.clock must be running, .* got frozen"):
+        a_search()(renderer, frames)

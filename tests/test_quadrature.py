@@ -213,6 +213,19 @@ def test_rays_without_light_are_sampled_uniformly() -> None:
     torch.testing.assert_close(drawn[0], torch.tensor([1.25, 1.75, 2.25, 2.75]))
 
 
+@pytest.mark.parametrize("rule", RULES)
+def test_padding_changes_no_picture(rule: str) -> None:
+    samples = uniform(5).packed()
+    density = torch.tensor([0.3, 2, 1, 4, 0.5], dtype=DOUBLE)
+    rgb = torch.rand(5, 3, dtype=DOUBLE)
+    plain = composite(samples, FieldOutput(density, rgb), quadrature=rule)
+    # The field says of padding what it says where the last sample ends: anything.
+    more = FieldOutput(torch.cat([density, density.new_full((3,), 7.0)]), torch.cat([rgb, rgb.new_ones(3, 3)]))
+    padded = composite(samples.padded(8), more, quadrature=rule)
+    torch.testing.assert_close(padded.rgb, plain.rgb, rtol=0, atol=1e-15)
+    torch.testing.assert_close(padded.opacity, plain.opacity, rtol=0, atol=1e-15)
+
+
 def test_unknown_rule_is_named() -> None:
     with pytest.raises(ValueError, match="quadrature must be one of constant, linear, parabolic; got 'simpson'"):
         composite(uniform(2), FieldOutput(torch.ones(1, 2), torch.ones(1, 2, 3)), quadrature="simpson")

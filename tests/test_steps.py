@@ -179,7 +179,10 @@ def test_rays_follow_how_full_places_are(fullness: float, rays: int) -> None:
 
 def test_rays_have_bounds() -> None:
     assert rays_that_fit(5000, 0.1, 6000) == 6000 // ROUND_TO * ROUND_TO
-    assert rays_that_fit(300, 5.0, 6000) == ROUND_TO
+    assert rays_that_fit(300, 5.0, 6000) == 64  # below what is rounded to, powers of two
+    assert rays_that_fit(100, 1.2, 100) == 64
+    assert rays_that_fit(64, 0.1, 100) == 64
+    assert rays_that_fit(1, 9.0, 100) == 1
 
 
 def test_training_with_fixed_places_learns(frames: Frames) -> None:

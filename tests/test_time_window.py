@@ -48,6 +48,7 @@ def test_an_open_window_changes_nothing() -> None:
 
 def test_frames_of_one_time_come_in_together() -> None:
     assert seen(TimeWindow(0.5, start=0.1), [0.3] * 10, 0.0) == {0.3}
+    assert TimeWindow(0.5, start=0.1).frames_in(torch.full((10,), 0.3), 0.0) is None  # all of them
     assert len(set((draw(TimeWindow(0.5, start=0.1), [0.3] * 10, 0.0) // SIZE).tolist())) == 10
     both_sides = draw(TimeWindow(0.5, start=0.4), [0.0, 0.4, 0.5, 0.6, 1.0], 0.0) // SIZE
     assert set(both_sides.tolist()) == {1, 2, 3}

@@ -2,8 +2,12 @@
 
 import pytest
 import torch
+from reference import fog
+from torch import Tensor
 
 from dnerf.cameras import Camera, Intrinsics, look_at
+from dnerf.deformations import Deformation
+from dnerf.fields import DeformedField
 from dnerf.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
@@ -85,3 +89,42 @@ def test_colors_are_plain_bytes() -> None:
     colors = track_colors(torch.randn(7, 3))
     assert len(set(colors)) == 7
     assert all(0 <= channel <= 255 and isinstance(channel, int) for color in colors for channel in color)
+
+
+def test_no_points_and_no_times_are_an_answer_and_an_error(renderer: Renderer) -> None:
+    assert track_colors(torch.zeros(0, 3)) == []
+    _, pictures = render_tracks(renderer, CAMERA, torch.zeros(0, 3), 0.0, [0.0, 0.5])
+    assert [picture.shape for picture in pictures] == [(50, 60, 3)] * 2
+    with pytest.raises(ValueError, match="pixels must be of one time at least, got none"):
+        draw_tracks(torch.zeros(4, 4, 3), torch.zeros(0, 1, 2), torch.ones(1, dtype=torch.bool), [(0, 0, 0)])
+
+
+def test_trails_have_gaps_where_places_are_unknown() -> None:
+    places = torch.tensor([[5.0, 20], [20, 20], [torch.nan, torch.nan], [40, 20], [55, 20]])
+    drawn = draw_tracks(torch.zeros(40, 60, 3), places[:, None], torch.tensor([True]), [(255, 0, 0)])
+    red = drawn[20, :, 0].float()
+    assert bool((red[7:18] > 200).all())
+    assert bool((red[43:53] > 200).all())
+    assert torch.count_nonzero(red[24:36]) == 0
+
+
+class Passage(Deformation):
+    """All moves by 3 along y."""
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        return positions - times[..., None] * positions.new_tensor([0.0, 3.0, 0.0])
+
+
+def test_points_behind_the_camera_leave_no_trail() -> None:
+    """One that comes from behind: where a projection would mirror it, nothing is drawn."""
+    model = Renderer(DeformedField(Passage(), fog(0.0)), StratifiedSampler(4)).eval()
+    camera = Camera(Intrinsics.from_angle(60, 50, 0.69), look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    start = torch.tensor([[0.3, -1.0, 0.0]])
+    _, pictures = render_tracks(model, camera, start, 0.0, [0.0, 0.25, 1.0], tolerance=10.0)
+    drawn = list(pictures)[-1].float()
+    plain = model.render_image(camera, 1.0).rgb
+    changed = ((drawn / 255 - plain).abs().amax(-1) > 0.1).nonzero()
+    assert len(changed)
+    # It is 2 ahead and 0.3 to the right of the middle in the end, and that dot is all there is to see.
+    column = 29.5 + 0.3 / 2 * camera.intrinsics.focal_x
+    assert bool(((changed[:, 1] - column).abs() < 4).all())

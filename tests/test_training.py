@@ -259,3 +259,25 @@ def test_turns_must_be_whole_and_positive(every, expected):
 def test_values_by_name_are_named_when_they_are_wrong(name, value, expected):
     with pytest.raises(ValueError, match=expected):
         trainer(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("warmup_steps", -2, "warmup_steps must be >= 0 and finite, got -2"),
+        ("warmup_steps", 1.5, "warmup_steps must be a whole number, got 1.5"),
+        ("num_rays", 100.5, "num_rays must be a whole number, got 100.5"),
+        ("epsilon", -1, "epsilon must be >= 0 and finite, got -1"),
+        ("betas", (0.9,), r"betas must be two numbers in \[0, 1\), got \(0.9,\)"),
+        ("betas", (0.9, 1.0), r"betas must be two numbers in \[0, 1\), got \(0.9, 1.0\)"),
+        ("orthogonal", "field", "orthogonal must be a list of names' beginnings, got 'field'"),
+    ],
+)
+def test_settings_of_the_optimizer_are_checked(name, value, expected):
+    with pytest.raises(ValueError, match=expected):
+        trainer(**{name: value})
+
+
+def test_a_training_without_a_second_left_is_refused(frames):
+    with pytest.raises(ValueError, match=r"seconds must be in \[0, max_seconds\) = \[0, 1\), got 2.0"):
+        trainer(max_seconds=1).fit(small_renderer(), frames, seconds=2.0)

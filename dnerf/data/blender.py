@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 from dnerf.backgrounds import parse_color
-from dnerf.checks import check_positive
+from dnerf.checks import check_whole
 from dnerf.data.frames import Frames
 from dnerf.data.images import MAX_PIXELS, read_header, read_image, straight_alpha
 from dnerf.data.manifest import Manifest, read_manifest
@@ -65,7 +65,7 @@ def load_blender(
     root = Path(root)
     _check_split(split)
     if resolution is not None:
-        check_positive("resolution", resolution)
+        check_whole("resolution", resolution)
     if not root.is_dir():
         raise ValueError(f"root must be a data set's folder, got {root}")
     manifest = read_manifest(root, split, max_frames)
@@ -120,7 +120,7 @@ def save_blender(frames_by_split: Mapping[str, Frames], root: str | Path) -> Non
         ValueError: if there are no splits, a name is not plain, colours exceed their alpha (not premultiplied), or
             `root` holds something.
     """
-    root = Path(os.path.abspath(root))
+    root = Path(os.path.realpath(root))
     if not frames_by_split:
         raise ValueError("frames_by_split must hold at least one split, got none")
     for split, frames in frames_by_split.items():

@@ -96,7 +96,7 @@ class BlenderData(DataSource):
 class SyntheticData(DataSource):
     """Exact frames of an analytic scene: random views of the upper half space, training times evenly over [0, 1].
 
-    Test and validation times lie midway between training times, so they are unseen.
+    Test and validation times are the middles of as many equal parts of the film.
 
     Args:
         scene: what is rendered.

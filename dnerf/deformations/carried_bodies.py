@@ -86,11 +86,12 @@ class CarriedBodies(nn.Module):
 
         Args:
             track: (num_knots, 3), its centres in world units.
-            home: (3,), the centre of an empty ball, off all tracks.
+            home: (3,), the centre of an empty ball, off all tracks and homes.
             radius: of the balls that are exchanged, in world units.
 
         Raises:
-            ValueError: if there is no room, for shapes that do not fit, or if the balls meet at a knot.
+            ValueError: if there is no room, for shapes that do not fit, or if a home's ball meets another one, at a
+                knot at least; tracks of two bodies may cross.
         """
         number = self.num_bodies
         if number == len(self.radii):
@@ -98,9 +99,18 @@ class CarriedBodies(nn.Module):
         check_shape("track", track, (self.num_knots, 3))
         check_shape("home", home, (3,))
         check_positive("radius", radius)
-        nearest = float((track - home).norm(dim=-1).amin())
-        if not nearest > 2 * radius:
-            raise ValueError(f"home must be {2 * radius:.3g} away from the track, got {nearest:.3g}")
+        meetings = [("home must be {} away from the track", track - home, 2 * radius)]
+        for other in range(number):
+            reach = radius + float(self.radii[other])
+            meetings += [
+                (f"home must be {{}} away from home {other}", home - self.homes[other], reach),
+                (f"home must be {{}} away from track {other}", self.tracks[other] - home, reach),
+                (f"track must be {{}} away from home {other}", track - self.homes[other], reach),
+            ]
+        for expected, ways, reach in meetings:
+            nearest = float(ways.norm(dim=-1).amin())
+            if not nearest > reach:
+                raise ValueError(f"{expected.format(f'{reach:.3g}')}, got {nearest:.3g}")
         self.tracks[number] = track
         self.homes[number] = home
         self.radii[number] = radius

@@ -60,7 +60,7 @@ def invert(
         jacobian = jacobians(deformation, x, times)
         # Damped, for there to be a step where the map is flat.
         damped = jacobian.mT @ jacobian + 1e-6 * inverse_jacobian
-        inverse_jacobian = torch.linalg.solve(damped, jacobian.mT)
+        inverse_jacobian = _solved(damped, jacobian.mT)
     error = deformation(x, times) - canonical
     best, residual = x, error.norm(dim=-1)
     for _ in range(num_iterations - 1):
@@ -103,7 +103,8 @@ def attach_gradient(deformation: Map, world: Tensor, canonical: Tensor, times: T
     Differentiable once. J must not be singular.
     """
     world = world.detach()
-    inverse_jacobian = torch.linalg.inv(jacobians(deformation, world, times))
+    jacobian = jacobians(deformation, world, times)
+    inverse_jacobian = _solved(jacobian, torch.eye(3, dtype=jacobian.dtype, device=jacobian.device).expand_as(jacobian))
     return world - _apply(inverse_jacobian, deformation(world, times) - canonical)
 
 
@@ -114,6 +115,12 @@ def jacobians(deformation: Map, positions: Tensor, times: Tensor) -> Tensor:
         moved = deformation(x, times.detach())
         rows = [torch.autograd.grad(moved[..., i].sum(), x, retain_graph=i < 2)[0] for i in range(3)]
     return torch.stack(rows, dim=-2)
+
+
+def _solved(matrices: Tensor, right: Tensor) -> Tensor:
+    """What times matrices (..., 3, 3) gives the right side; in single precision at least, and rounded then."""
+    precise = torch.promote_types(matrices.dtype, torch.float32)
+    return torch.linalg.solve(matrices.to(precise), right.to(precise)).to(matrices.dtype)
 
 
 def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:

@@ -118,7 +118,8 @@ class FlowDeformation(InvertibleDeformation):
             return self(self.reverse(target, times), times)
 
         with torch.no_grad():
-            target, _ = invert(round_trip, canonical, times, num_iterations=self.corrections)
+            # The first evaluation only measures the guess.
+            target, _ = invert(round_trip, canonical, times, num_iterations=self.corrections + 1)
             world = self.reverse(target, times)
         trained = any(parameter.requires_grad for parameter in self.parameters())
         if torch.is_grad_enabled() and (trained or canonical.requires_grad or times.requires_grad):

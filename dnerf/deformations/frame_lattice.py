@@ -120,7 +120,8 @@ class FrozenDeformation(Deformation):
         check_one_time(times, self.time)
         self.move_to(positions.device)
         points = positions.reshape(-1, 3)
-        unit = (points - self.low.to(points.dtype)) / self.sides.to(points.dtype)
+        precise = points.to(torch.promote_types(points.dtype, torch.float32))  # as the lookup's own
+        unit = (precise - self.low.to(precise.dtype)) / self.sides.to(precise.dtype)
         displacements = grid_encode(unit, self.displacements, self.levels)[:, :3]
         lacks = displacements[:, 0].isnan()
         if bool(lacks.any()):

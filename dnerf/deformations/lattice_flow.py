@@ -22,7 +22,8 @@ class LatticeFlow(InvertibleDeformation):
 
     Args:
         flow: what is integrated.
-        box: (2, 3) corners of the lattice; matter outside does not move.
+        box: (2, 3) corners of the lattice; matter outside moves as the nearest face does: not at all where that is
+            the velocity's own box.
         resolution: cells along the box's longest side.
         num_knots: times at which the flow is integrated, evenly from 0 to 1.
         pad_to: the number of vertices is rounded up to a multiple of this, since matrix libraries compile code for

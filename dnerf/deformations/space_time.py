@@ -49,6 +49,8 @@ class SpaceTimeLattice(nn.Module):
             positions: (N, 3) in world units; those outside the box count as on its faces.
             times: (N,); those outside [0, 1] count as 0 or 1.
         """
+        precise = torch.promote_types(positions.dtype, torch.float32)  # knots times layers have no room in half of it
+        positions, times = positions.to(precise), times.to(precise)
         scaled = times.clamp(0, 1) * (self.num_knots - 1)
         knots = scaled.detach().floor().clamp(max=self.num_knots - 2)
         unit = ((positions - self.low.to(positions.dtype)) / self.sides.to(positions.dtype)).clamp(0, 1)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import check_shape
+from dnerf.checks import check_positive, check_shape
 from dnerf.compositing import FieldOutput
 from dnerf.deformations.base import check_positions_times
 from dnerf.encodings import SinusoidalEncoding
@@ -31,6 +31,9 @@ class NeRFField(RadianceField):
         direction_frequencies: octaves of the directions' encoding, used only if view-dependent.
         density_activation: "softplus" or "exp".
         density_shift: added before the activation.
+
+    Raises:
+        ValueError: for sizes that are not positive, or skips that name no layer.
     """
 
     def __init__(
@@ -46,6 +49,7 @@ class NeRFField(RadianceField):
         density_shift: float = -1.0,
     ) -> None:
         super().__init__()
+        check_positive("num_layers", num_layers)
         self.density_activation = density_activation
         self.density_shift = density_shift
         self.encode_positions = SinusoidalEncoding(3, position_frequencies)

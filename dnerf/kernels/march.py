@@ -199,7 +199,7 @@ def interval_ranges(
     parallel = directions == 0
     divisor = directions.masked_fill(parallel, 1)
     lower, upper = (aabb[0] - origins) / divisor, (aabb[1] - origins) / divisor
-    outside = torch.where((origins < aabb[0]) | (origins > aabb[1]), torch.inf, -torch.inf).to(near.dtype)
+    outside = torch.where((origins >= aabb[0]) & (origins <= aabb[1]), -torch.inf, torch.inf).to(near.dtype)
     enter = torch.where(parallel, outside, lower.minimum(upper)).amax(-1).maximum(near)
     leave = torch.where(parallel, -outside, lower.maximum(upper)).amin(-1).minimum(far)
     length = leave - enter

@@ -32,7 +32,7 @@ def end_point_error(motion: Tensor, truth: Tensor, mask: Tensor | None = None) -
 
 
 def flow_outliers(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """Share of vectors that are off by more than 3 pixels and by more than 5 % of their true length.
+    """Share of vectors that are off by more than 3 pixels and by more than 5 % of their true length, or no numbers.
 
     Source: "Fl" of KITTI (Menze and Geiger, "Object scene flow for autonomous vehicles", CVPR 2015).
 
@@ -42,7 +42,7 @@ def flow_outliers(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> fl
         mask: (...,) bool, which count; all if None.
     """
     errors, lengths = _lengths(flow, truth, mask)
-    return float(((errors > 3) & (errors > 0.05 * lengths)).double().mean())
+    return float((~((errors <= 3) | (errors <= 0.05 * lengths))).double().mean())
 
 
 def scene_flow_accuracy(motion: Tensor, truth: Tensor, threshold: float, mask: Tensor | None = None) -> float:
@@ -119,7 +119,7 @@ def track_errors(
         accuracy = sum(shares) / len(shares)
     return TrackErrors(
         mean=float(errors.sum() / seen.sum()),
-        median=float(per_track.median()) if len(per_track) else torch.nan,
+        median=float(per_track.quantile(0.5)) if len(per_track) else torch.nan,
         final=by_time[-1],
         by_time=(0.0, *by_time),
         accuracy=accuracy,

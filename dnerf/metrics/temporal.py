@@ -21,10 +21,12 @@ def sample_picture(picture: Tensor, pixels: Tensor) -> Tensor:
         (..., C) or (...,).
 
     Raises:
-        ValueError: if the last axis of pixels is not 2 long.
+        ValueError: if the last axis of pixels is not 2 long, or a pixel is no number.
     """
     if pixels.shape[-1:] != (2,):
         raise ValueError(f"pixels must have shape (..., 2), got {tuple(pixels.shape)}")
+    if bool(pixels.isnan().any()):
+        raise ValueError(f"pixels must be numbers, got {int(pixels.isnan().any(-1).sum())} that are not")
     height, width = picture.shape[:2]
     column, row = pixels[..., 0].clamp(0, width - 1), pixels[..., 1].clamp(0, height - 1)
     left, top = column.floor().clamp(max=max(width - 2, 0)), row.floor().clamp(max=max(height - 2, 0))

@@ -13,6 +13,7 @@ from dnerf.samplers.masks import slab_halves, spread_over, widened
 
 SPACE = (1, 2, 3)  # axes
 NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no picture shows
+OPAQUE = 1e4  # as what infinite density counts, and what is no number: samples have to see it, and it can decay
 
 
 class OccupancyGrid(Sampler):
@@ -115,7 +116,7 @@ class OccupancyGrid(Sampler):
         cells = torch.cat([times[:, None], unit], dim=-1) * self.shape
         cells = torch.minimum(cells.long().clamp_(min=0), self.shape - 1)
         flat = (cells * self.strides).sum(-1)
-        self.maxima.view(-1).scatter_reduce_(0, flat, density.to(self.maxima.dtype), "amax")
+        self._enter(flat, density)
 
     def probes(self, step: int) -> Tensor | None:
         """Every `update_every` steps, numbers (num_probes, 5) in [0, 1): which cell, and where in it."""
@@ -169,8 +170,11 @@ class OccupancyGrid(Sampler):
             self._set(occupied, widened(slab_halves(dense), SPACE if self.render_margin else []))
 
     def _probe(self, field: RadianceField, cells: Tensor, within: Tensor) -> None:
-        density = field.density(*self._within(cells, within))
-        self.maxima.view(-1).scatter_reduce_(0, cells, density.to(self.maxima.dtype), "amax")
+        self._enter(cells, field.density(*self._within(cells, within)))
+
+    def _enter(self, cells: Tensor, density: Tensor) -> None:
+        known = density.to(self.maxima.dtype).nan_to_num(nan=OPAQUE, posinf=OPAQUE)
+        self.maxima.view(-1).scatter_reduce_(0, cells, known, "amax")
 
     def _within(self, cells: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
         """Positions (N, 3) and times (N,) at places (N, 4) in [0, 1] within cells (N,)."""

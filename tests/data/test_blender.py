@@ -141,6 +141,7 @@ def test_spoilt_scenes_are_refused_in_one_line(
     [
         ({"resolution": 9}, "resolution must be at most the images' width 8"),
         ({"resolution": 0}, "resolution must be > 0"),
+        ({"resolution": 7.9}, "resolution must be a whole number, got 7.9"),
         ({"split": "../train"}, "split must be a plain name"),
         ({"split": ""}, "split must be a plain name"),
         ({"split": "test"}, "transforms_test.json: file does not exist"),
@@ -243,6 +244,10 @@ def test_an_empty_folder_is_filled_and_parents_are_made(tmp_path: Path) -> None:
     for root in (tmp_path / "empty", tmp_path / "a" / "b"):
         save_blender({"train": random_frames()}, root)
         assert len(load_blender(root, "train")) == 3
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    save_blender({"train": random_frames()}, tmp_path / "link")
+    assert len(load_blender(tmp_path / "elsewhere", "train")) == 3
 
 
 @pytest.mark.parametrize("splits", [{}, {"../train": None}, {"": None}, {".hidden": None}])

@@ -1,5 +1,7 @@
 """Bodies that are carried: balls of space exchanged with empty ones at home."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given
@@ -166,6 +168,33 @@ def test_what_cannot_be_carried() -> None:
         CarriedBodies(1, 1)
     with pytest.raises(ValueError, match="max_bodies"):
         CarriedBodies(0)
+
+
+@pytest.mark.parametrize(
+    ("track", "home", "expected"),
+    [
+        (tracks()[1], HOMES[0], "home must be 0.5 away from home 0, got 0"),
+        (tracks()[1], tracks()[0][5], "home must be 0.5 away from track 0, got 0"),
+        (HOMES[0].expand(11, 3), HOMES[1], "track must be 0.5 away from home 0, got 0"),
+    ],
+)
+def test_homes_meet_no_other_body(track: Tensor, home: Tensor, expected: str) -> None:
+    bodies = CarriedBodies(3, 11).double()
+    bodies.add(tracks()[0], HOMES[0], 0.3)
+    with pytest.raises(ValueError, match=expected):
+        bodies.add(track, home, 0.2)
+    assert bodies.num_bodies == 1
+
+
+def test_home_of_an_absent_body_holds_no_matter_that_moves() -> None:
+    bodies = CarriedBodies(1, 11)
+    track = tracks()[0].float()
+    track[:4] = NOWHERE
+    bodies.add(track, HOMES[0].float(), 0.3)
+    points = torch.stack([HOMES[0].float(), torch.zeros(3)])
+    moved, residual = carry(CarriedDeformation(bodies, IdentityDeformation()), points, 0.1, 0.1)
+    assert torch.equal(moved, points)
+    assert residual.tolist() == [math.inf, 0.0]
 
 
 @pytest.mark.parametrize("inner", [IdentityDeformation(), DisplacementDeformation(2, 16, ())])

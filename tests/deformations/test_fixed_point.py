@@ -114,3 +114,20 @@ def test_attached_gradient_is_that_of_the_inverse() -> None:
 def test_bad_arguments_are_refused(arguments: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         invert(gentle_displacement(), torch.zeros(4, 3).double(), torch.zeros(4).double(), **arguments)
+
+
+def test_half_precision_is_solved_in_single() -> None:
+    """To the rounding of positions of up to 1.5 in bfloat16, 2^-8, a few times."""
+    deformation = gentle_displacement().float()
+    positions, times = (x.float() for x in points(200))
+    canonical = deformation(positions, times)
+    with torch.autocast("cpu", enabled=False):
+        half = gentle_displacement().bfloat16()
+        half.load_state_dict({name: value.bfloat16() for name, value in deformation.state_dict().items()})
+        target, at = canonical.bfloat16(), times.bfloat16()
+        for use_jacobian in (False, True):
+            found, residual = invert(half, target, at, use_jacobian=use_jacobian)
+            assert residual.float().median() < 0.01
+            solved = attach_gradient(half, found, target, at).detach()
+            assert solved.dtype == torch.bfloat16
+            assert float((solved.float() - positions).norm(dim=-1).median()) < 0.04

@@ -82,6 +82,15 @@ def test_corrections_invert_few_coarse_steps(velocity: NetworkVelocity) -> None:
     torch.testing.assert_close(corrected.inverse(canonical, times), positions, rtol=0, atol=1e-6)
 
 
+def test_each_correction_corrects(velocity: NetworkVelocity) -> None:
+    positions, times = points(500)
+    misses = []
+    for corrections in (0, 1, 2, 4):
+        flow = flow_of(velocity, solver="midpoint", num_steps=2, corrections=corrections)
+        misses.append((flow.inverse(flow(positions, times), times) - positions).norm(dim=-1).mean().item())
+    assert misses[0] > 2 * misses[1] > 4 * misses[2] > 8 * misses[3]
+
+
 @pytest.mark.parametrize(("clock", "solver", "steps"), [("running", "rk4", 8), ("frozen", "midpoint", 1)])
 def test_jacobian_determinant_stays_positive(velocity: NetworkVelocity, clock: str, solver: str, steps: int) -> None:
     flow = flow_of(velocity, torch.float64, clock=clock, solver=solver, num_steps=steps)

@@ -280,3 +280,15 @@ def test_other_numbers_are_kept_beside_displacements() -> None:
     torch.testing.assert_close(rows[:, 4:7], (vertices + rows[:, :3]).sin(), rtol=0, atol=1e-6)
     assert (rows[:, 7] == torch.tensor(0.3)).all()
     assert frozen.displacements[~known].isnan().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_positions_in_half_precision_find_their_cells(dtype: torch.dtype) -> None:
+    bend = Bend()
+    axis = torch.linspace(-1, 1, 41)
+    positions = torch.cartesian_prod(axis, axis, axis)[::7].to(dtype)
+    frozen = FrameLattice([[-1.0] * 3, [1.0] * 3], 20).at_time(bend, 0.5)
+    moved = frozen(positions, positions.new_full((len(positions),), 0.5))
+    exact = bend(positions.float(), torch.full((len(positions),), 0.5))
+    # The lattice's own error, see above, and the rounding of the sum.
+    torch.testing.assert_close(moved.float(), exact, rtol=0, atol=0.18 * 0.1**2 / 8 * 3 + 2**-7)

@@ -50,3 +50,13 @@ def test_nothing_to_carry() -> None:
 def test_bad_settings_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name} must be > 0"):
         LatticeFlow(FlowDeformation(Rotation(), 0.0), BOX, 4, 3, **{name: 0})
+
+
+def test_half_precision_finds_the_same_cells() -> None:
+    """Knots times layers have no room in bfloat16; what is left is the rounding of positions and of what is added."""
+    seen = LatticeFlow(FlowDeformation(Rotation(), 0.0), BOX, 16, 17)
+    positions = (torch.rand(2000, 3) * 2 - 1).bfloat16()
+    times = torch.rand(2000).bfloat16()
+    located = seen.lattice.locate(positions, times)
+    exact = seen.lattice.locate(positions.float(), times.float())
+    assert all(torch.equal(a, b) for a, b in zip(located, exact, strict=True))

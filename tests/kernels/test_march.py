@@ -205,6 +205,12 @@ def test_rays_that_are_not_finite_get_no_samples(compiled):
     occupancy = torch.ones(1, 4, 4, 4, dtype=torch.bool, device=compiled)
     result = march(**arguments, occupancy=occupancy, aabb=BOX.to(compiled), step=0.1)
     assert len(result.starts) == 0
+    # Also where the ray does not move along the axis on which it is not finite.
+    arguments = {k: v.to(compiled) for k, v in rays(4).items()}
+    arguments["origins"] = torch.tensor([[torch.nan, 0.0, -3.0]], device=compiled).expand(4, 3).contiguous()
+    arguments["directions"] = torch.tensor([[0.0, 0.0, 1.0]], device=compiled).expand(4, 3).contiguous()
+    result = march(**arguments, occupancy=occupancy, aabb=BOX.to(compiled), step=0.1)
+    assert len(result.starts) == 0
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def test_track_errors_by_hand() -> None:
     tracks[2, 1, 1] = 2
     errors = track_errors(tracks, truth)
     assert errors.mean == pytest.approx((1 + 3 + 0 + 2) / 4)
-    assert errors.median == pytest.approx(1)  # of 2 and 1, torch takes the lower
+    assert errors.median == pytest.approx(1.5)  # halfway between 2 and 1
     assert errors.final == pytest.approx(2.5)
     assert errors.by_time == pytest.approx((0, 0.5, 2.5))
     assert math.isnan(errors.accuracy)
@@ -70,3 +70,9 @@ def test_what_cannot_be_compared_is_named() -> None:
         end_point_error(torch.zeros(2, 2), torch.zeros(2, 3))
     with pytest.raises(ValueError, match="mask must have shape"):
         end_point_error(torch.zeros(2, 2), torch.zeros(2, 2), torch.zeros(3, dtype=torch.bool))
+
+
+def test_what_is_no_number_is_an_outlier() -> None:
+    truth = 10 * torch.ones(4, 2)
+    assert flow_outliers(torch.full((4, 2), math.nan), truth) == 1
+    assert flow_outliers(torch.cat([truth[:3], truth[3:] * math.nan]), truth) == 0.25

@@ -141,3 +141,5 @@ def test_what_does_not_fit_is_named() -> None:
         temporal_psnr(torch.zeros(2, 4, 4, 3), torch.zeros(3, 4, 4, 3))
     with pytest.raises(ValueError, match=r"pixels must have shape \(..., 2\)"):
         sample_picture(first, torch.zeros(4, 3))
+    with pytest.raises(ValueError, match="pixels must be numbers, got 1 that are not"):
+        sample_picture(first, torch.tensor([[0.0, 1.0], [math.nan, 1.0]]))

@@ -260,6 +260,22 @@ def test_lost_matter_comes_back() -> None:
     torch.testing.assert_close(opacity(sampler, MovingBall())[0], opacity(small(), MovingBall())[0], rtol=0, atol=1e-2)
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_is_no_number_somewhere_empties_nothing_elsewhere_and_decays(value: float) -> None:
+    sampler, ball = small(decay=0.5), MovingBall()
+    sampler.fill(ball)
+    occupied = sampler.occupied.clone()
+    place = torch.tensor([[0.9, 0.9, 0.9]])
+    sampler.observe(place, torch.zeros(1), torch.tensor([value]))
+    sampler.decide()
+    assert bool(sampler.occupied[occupied].all())
+    assert bool(sampler.occupied[0, 15, 15, 15])  # samples will see what is wrong there
+    for step in range(sampler.update_every, 60 * sampler.update_every, sampler.update_every):
+        sampler.update(ball, step)
+    assert not bool(sampler.occupied[0, 15, 15, 15])
+    assert bool(sampler.maxima.isfinite().all())
+
+
 def test_updates_only_happen_at_their_steps() -> None:
     sampler = small()
     before = sampler.maxima.clone()
