@@ -214,6 +214,34 @@ def reach(frames: Frames) -> Tensor:
     return torch.stack([places.amin(0), places.amax(0)])
 
 
+def check_views(frames: Frames, box: Tensor) -> None:
+    """Raise unless some pixel's ray is in the box between the planes: otherwise there is nothing to learn from.
+
+    One of `EVERY_PIXEL` squared pixels of each view is asked.
+
+    Args:
+        frames: of the training.
+        box: (2, 3) corners, in world units.
+
+    Raises:
+        ValueError: naming the box, the planes and where the cameras' rays are between them.
+    """
+    box = box.to(frames.poses.device)
+    width, height = frames.intrinsics.width, frames.intrinsics.height
+    rows, columns = (torch.arange(0, size, EVERY_PIXEL, device=box.device) for size in (height, width))
+    pixels = (width * rows[:, None] + columns).reshape(-1)
+    for index in range(len(frames)):
+        rays = frames.camera(index).rays(0.0, pixels)
+        enter, leave = ray_box(rays.origins, rays.directions, box)
+        if bool((enter.maximum(rays.near) < leave.minimum(rays.far)).any()):
+            return
+    raise ValueError(
+        f"box must be seen by some camera between near {frames.near:g} and far {frames.far:g}, got {box.tolist()}; "
+        f"what cameras see there lies within {reach(frames).tolist()}: other units, or another data.box, data.near or "
+        "data.far, are meant"
+    )
+
+
 def shows_outside(frames: Frames, box: Tensor) -> bool:
     """Whether an opaque pixel looks past a box (2, 3), so that matter lies outside; pictures without alpha do not tell.
 

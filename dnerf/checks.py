@@ -51,7 +51,7 @@ def check_whole(name: str, value: float, *, allow_zero: bool = False) -> None:
         ValueError: naming the argument and its value.
     """
     check_positive(name, value, allow_zero=allow_zero)
-    if int(value) != value:
+    if isinstance(value, bool) or int(value) != value:
         raise ValueError(f"{name} must be a whole number, got {value}")
 
 

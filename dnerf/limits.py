@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from dnerf.checks import check_positive
+from dnerf.checks import check_positive, check_whole
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class Limits:
         checkpoint_every: steps between checkpoints; None for none before the end.
 
     Raises:
-        ValueError: for numbers that are not positive.
+        ValueError: for numbers that are not positive, or not whole where they count.
     """
 
     num_steps: int
@@ -25,9 +25,12 @@ class Limits:
     checkpoint_every: int | None
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value is not None:
-                check_positive(name, value)
+        check_whole("num_steps", self.num_steps)
+        check_whole("log_every", self.log_every)
+        if self.checkpoint_every is not None:
+            check_whole("checkpoint_every", self.checkpoint_every)
+        if self.max_seconds is not None:
+            check_positive("max_seconds", self.max_seconds)
 
     def progress(self, step: int, seconds: float, begun: float) -> float:
         """How much of training is over, in [0, 1]: of its steps or of its seconds, whichever is more.

@@ -254,6 +254,11 @@ class CheckpointFolder:
             raise ValueError(f"{self.folder}: no checkpoint can be read; {problems[0]}")
         return None
 
+    @property
+    def is_begun(self) -> bool:
+        """Whether there is any checkpoint, whole or not."""
+        return bool(self._files())
+
     def clear(self) -> None:
         """Remove all checkpoints."""
         for path in self._files():

@@ -37,7 +37,7 @@ def seen_points(renderer: Renderer, camera: Camera, time: float, spacing: int, *
     check_positive("spacing", spacing)
     check_positive("chunk", chunk)
     width, height = camera.intrinsics.width, camera.intrinsics.height
-    rows, columns = (torch.arange(spacing // 2, size, spacing) for size in (height, width))
+    rows, columns = (torch.arange(min(spacing, size) // 2, size, spacing) for size in (height, width))
     pixels = (width * rows[:, None] + columns).reshape(-1).to(camera.pose.device)
     found = [camera.pose.new_zeros(0, 3)]
     for part in pixels.split(chunk):

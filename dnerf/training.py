@@ -134,6 +134,8 @@ class Trainer:
             ("error_map", error_map, ErrorMap),
             ("missing_matter", missing_matter, MissingMatterCheck),
             ("body_search", body_search, BodySearch),
+            ("recovery", recovery, Recovery),
+            ("box_check", box_check, BoxCheck),
         )
         for name, part, kind in kinds:
             if part is not None and not isinstance(part, kind):

@@ -80,23 +80,41 @@ def write_frames(
     path = Path(path)
     format = format or path.suffix[1:].lower() or "png"
     check_choice("format", format, FORMATS)
-    check_positive("fps", fps)
-    if format == "gif" and fps > MAX_GIF_FPS:
-        raise ValueError(f"fps must be at most {MAX_GIF_FPS} for gif, got {fps}")
+    check_fps(fps, format)
     if not 0 <= quality <= 10:
         raise ValueError(f"quality must be in [0, 10], got {quality}")
     pictures = _pictures(images)
     if format == "png":
         _write_folder(pictures, path)
         return path
-    if path.suffix.lower() != f".{format}" or path.is_dir():
-        raise ValueError(f"path must be a file that ends in .{format}, got {path}")
+    check_film(path, format)
     with atomic_path(path) as temporary:
         if format == "mp4":
             _write_mp4(pictures, temporary, fps, quality)
         else:
             _write_gif(pictures, temporary, fps)
     return path
+
+
+def check_fps(fps: float, format: str) -> None:
+    """Raise unless films of a format can show so many frames a second.
+
+    Raises:
+        ValueError: for a number that is not positive, or too large for a GIF.
+    """
+    check_positive("fps", fps)
+    if format == "gif" and fps > MAX_GIF_FPS:
+        raise ValueError(f"fps must be at most {MAX_GIF_FPS} for gif, got {fps}")
+
+
+def check_film(path: Path, format: str) -> None:
+    """Raise unless a path may be that of a film in one file.
+
+    Raises:
+        ValueError: for a folder, or a name that ends otherwise.
+    """
+    if path.suffix.lower() != f".{format}" or path.is_dir():
+        raise ValueError(f"path must be a file that ends in .{format}, got {path}")
 
 
 def write_png(image: Tensor | NDArray, path: str | Path) -> Path:

@@ -5,15 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra_app import build, load_config, load_renderer, resolve_device, run_app
+from hydra_app import build, load_config, load_renderer, moved, resolve_device, run_app
 from omegaconf import DictConfig
 from reporting import evaluate_run, print_scores
 from torch import Tensor
 
 from dnerf.backgrounds import ConstantBackground
 from dnerf.cameras import Camera
-from dnerf.checks import check_choice
-from dnerf.data import SPLITS, DataSource, Frames, SyntheticData
+from dnerf.data import DataSource, Frames, SyntheticData
 from dnerf.evaluation import FrameScore, evaluate
 from dnerf.files import write_json, write_text
 from dnerf.logs import SHEET_COLUMNS
@@ -34,13 +33,12 @@ def main(config: DictConfig) -> None:
     if not runs or (config.runs and config.run is not None):
         raise ValueError("run: give run=<folder> or runs=[<folder>,...], one of the two")
     protocol = None if config.protocol is None else find_protocol(config.protocol)
-    for name in ("split", "lego_split"):
-        if config[name] is not None:
-            check_choice(name, config[name], SPLITS)
     lpips = lpips_metric(config.lpips.backbone, download=config.lpips.download) if config.lpips.enabled else None
-    # A wrong name in a long list should not be found out after hours.
+    # A wrong name or a damaged file in a long list should not be found out after hours.
     for run in runs:
-        load_config(run)
+        saved = load_config(run)
+        if len(runs) > 1:
+            load_renderer(run, saved, torch.device("cpu"))
     rows = [_score(config, run, protocol, lpips) for run in runs]
     if len(rows) > 1 or config.table is not None:
         _write_tables(config, runs, rows)
@@ -49,8 +47,7 @@ def main(config: DictConfig) -> None:
 def _score(config: DictConfig, run: str, protocol: Protocol | None, lpips: Lpips) -> dict[str, Any]:
     """Score one run and write everything into its folder; returns the scores."""
     saved = load_config(run)
-    if config.data_root is not None:
-        saved.data.root = config.data_root
+    moved(saved, config.data_root)
     if protocol is not None:
         saved.data.resolution = protocol.resolution
     scene = _scene_name(saved)

@@ -3,6 +3,7 @@
 import importlib
 import logging
 import os
+import re
 import signal
 import sys
 import traceback
@@ -21,6 +22,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from settings import check_settings
 
 import dnerf
 from dnerf.allocator import keep_freed_memory
@@ -49,21 +51,23 @@ def run_app(main: Callable[[DictConfig], None], config_name: str) -> None:
     _tell_workers_where_we_are()
     keep_freed_memory()
     with _one_line_errors():
-        hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(_as_job(main))()
+        hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(_as_job(main, config_name))()
         sweeps.finish()
 
 
-def _as_job(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+def _as_job(main: Callable[[DictConfig], None], script: str) -> Callable[[DictConfig], None]:
     """One job: its errors are caught here, before Hydra adds lines or, in a multirun, stops the sweep."""
 
     def job(config: DictConfig) -> None:
         if HydraConfig.get().mode == RunMode.RUN:
             with _one_line_errors():
+                check_settings(config, script)
                 main(config)
             return
         try:
             with _one_line_errors():
                 sweeps.begin_job()
+                check_settings(config, script)
                 main(config)
         except SystemExit as end:
             if end.code != WRONG_INPUT:
@@ -127,10 +131,27 @@ def _tell_workers_where_we_are() -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """An error's message on one line, of its cause where Hydra wraps it."""
+    """An error's message on one line, of its cause where Hydra wraps it; what Python says of a call names the place."""
+    place = ""
     while isinstance(error, HydraException) and error.__cause__ is not None:
+        found = re.search(r"full_key: (\S+)", str(error))
+        place = found.group(1) if found else place
         error = error.__cause__
-    return " ".join(line.strip() for line in str(error).splitlines() if line.strip())
+    line = " ".join(line.strip() for line in str(error).splitlines() if line.strip())
+    return f"{place}: {line}" if place and not isinstance(error, USER_ERRORS) else line
+
+
+def moved(saved: DictConfig, data_root: str | None) -> None:
+    """Let a run's config know where its scene lies now, if it has moved.
+
+    Raises:
+        ValueError: if a place is given for a scene that lies nowhere.
+    """
+    if data_root is None:
+        return
+    if "root" not in saved.data:
+        raise ValueError(f"data_root must be null, this run's frames are of an exact scene, got {data_root}")
+    saved.data.root = data_root
 
 
 def build(config: DictConfig) -> Any:

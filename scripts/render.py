@@ -3,19 +3,19 @@
 import hashlib
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
 
 import torch
 import torch.distributed
-from hydra_app import build, load_config, load_renderer, resolve_device, run_app
+from hydra_app import build, load_config, load_renderer, moved, resolve_device, run_app
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import Tensor
 from tqdm import tqdm
 
 from dnerf.cameras import Intrinsics, fixed_path, look_at, orbit_path, spiral_path
-from dnerf.checks import check_choice, check_positive
+from dnerf.checks import check_choice
 from dnerf.data import DataSource, Frames, SyntheticData, render_exact
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
@@ -35,24 +35,20 @@ from dnerf.sequences import (
     write_films,
     write_plan,
 )
+from dnerf.video import check_fps
 
 TIME_PATHS = ("sweep", "pingpong", "slow")
 
 
 def main(config: DictConfig) -> None:
     """Load the run, follow the path, render what is missing, write the films."""
-    check_positive("num_frames", config.num_frames)
-    check_positive("fps", config.fps)
-    for name in ("exact", "keep_frames"):
-        if not isinstance(config[name], bool):
-            raise ValueError(f"{name} must be true or false, got {config[name]!r}")
     outputs, formats = _listed(config.outputs), _listed(config.format)
     check_outputs(outputs)
     for format in formats:
         check_choice("format", format, FILM_FORMATS)
+        check_fps(config.fps, format)
     saved = load_config(config.run)
-    if config.data_root is not None:
-        saved.data.root = config.data_root
+    moved(saved, config.data_root)
     share = Share(int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
     device = resolve_device(config.device)
     renderer = load_renderer(config.run, saved, device)
@@ -67,7 +63,7 @@ def main(config: DictConfig) -> None:
     }  # fmt: skip
     path = _output(config, formats)
     store = FrameStore(path.parent / f".{path.name}.{sequence_digest(views, facts)}", len(views))
-    truth = _truth(data, frames, renderer, same_size=config.resolution is None) if "compare" in outputs else None
+    truth = _truth(data, frames, renderer, views, same_size=config.resolution is None) if "compare" in outputs else None
     if share.size > 1:
         torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))
     if share.rank == 0:
@@ -91,12 +87,10 @@ def main(config: DictConfig) -> None:
             store.remove()
 
 
-def _split(renderer: Renderer, splits: object) -> None:
+def _split(renderer: Renderer, splits: int | None) -> None:
     """Have pictures cut the steps in which something is seen into so many; None for as many as the run says."""
     if splits is None:
         return
-    if not isinstance(splits, int) or isinstance(splits, bool) or splits < 1:
-        raise ValueError(f"splits must be a whole number of at least 1, got {splits!r}")
     if not isinstance(renderer.sampler, OccupancySampler):
         raise ValueError(f"splits must be null for a run with a {type(renderer.sampler).__name__}, got {splits}")
     renderer.sampler.render_splits = splits
@@ -143,10 +137,7 @@ def _resized(intrinsics: Intrinsics, resolution: int | ListConfig | None) -> Int
     if resolution is None:
         return intrinsics
     if isinstance(resolution, int):
-        check_positive("resolution", resolution)
         return intrinsics.resized(resolution, round(resolution * intrinsics.height / intrinsics.width))
-    if len(resolution) != 2:
-        raise ValueError(f"resolution must be a width or [width,height], got {list(resolution)}")
     angle = 2 * math.atan(0.5 * intrinsics.width / intrinsics.focal_x)
     return Intrinsics.from_angle(resolution[0], resolution[1], angle, intrinsics.pixel_origin)
 
@@ -185,8 +176,6 @@ def _times(config: DictConfig, count: int) -> list[float]:
             raise ValueError(f"time must be {', '.join(TIME_PATHS)} or a number in [0, 1], got {time}")
         return [float(time)] * count
     check_choice("time", time, TIME_PATHS)
-    if len(config.time_range) != 2:
-        raise ValueError(f"time_range must be two times, got {list(config.time_range)}")
     start, end = config.time_range
     if time == "slow":
         slow = OmegaConf.to_container(config.slow_motion)
@@ -195,8 +184,10 @@ def _times(config: DictConfig, count: int) -> list[float]:
     return (sweep_times if time == "sweep" else pingpong_times)(count, start, end)
 
 
-def _truth(data: DataSource, frames: Frames, renderer: Renderer, *, same_size: bool) -> Callable[[View], Tensor] | None:
-    """What gives the true picture of a view: the data's own picture, or the exact scene; None if neither does."""
+def _truth(
+    data: DataSource, frames: Frames, renderer: Renderer, views: Sequence[View], *, same_size: bool
+) -> Callable[[View], Tensor]:
+    """What gives the true picture of each view: the data's own picture, or the exact scene."""
     background = renderer.background(torch.zeros(1, 3, device=renderer.device))[0]
     if isinstance(data, SyntheticData):
         scene = data.scene.to(renderer.device)
@@ -207,11 +198,13 @@ def _truth(data: DataSource, frames: Frames, renderer: Renderer, *, same_size: b
 
         return exact
 
+    if not same_size or any(view.truth_index is None for view in views):
+        raise ValueError(
+            "outputs: compare needs true pictures: path=test at the data's own resolution, or an exact scene"
+        )
+
     def picture(view: View) -> Tensor:
-        if view.truth_index is None or not same_size:
-            raise ValueError(
-                "outputs: compare needs true pictures: path=test at the data's own resolution, or an exact scene"
-            )
+        assert view.truth_index is not None
         return frames.image(view.truth_index, background.cpu())
 
     return picture

@@ -10,10 +10,11 @@ import sweeps
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
-from hydra_app import load_config
+from hydra_app import load_config, moved
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dnerf.files import TEMPORARY, claimed, remove_leftovers, write_json, write_text
+from dnerf.run_state import CheckpointFolder
 
 # What may be another when a run is continued: how long, where and how it is watched, not what is trained.
 CHANGEABLE = (
@@ -21,6 +22,7 @@ CHANGEABLE = (
     "resume",
     "device",
     "process_timeout",
+    "data_root",
     "evaluate_split",
     "evaluate_frames",
     "chunk",
@@ -54,6 +56,10 @@ def continued(config: DictConfig) -> DictConfig:
     hydra = HydraConfig.get()
     overrides = OverridesParser.create().parse_overrides(list(hydra.overrides.task))
     given = {override.get_key_element().lstrip("+~").partition("@")[0] for override in overrides}
+    if _is_free(folder) and given - set(CHANGEABLE):  # it was refused, or stopped, before its first record
+        return config
+    if config.data_root is not None:
+        moved(saved, config.data_root)
     values = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     assert isinstance(values, DictConfig)
     fit = saved.get("box_fit")
@@ -135,22 +141,25 @@ def opened(config: DictConfig) -> Iterator[Path]:
     """Make or reopen a run's folder and hold it for this process; the resolved config lies in it.
 
     Raises:
-        ValueError: if the folder holds another run and `resume` is not set, holds no run at all or links, or is in use.
+        ValueError: if the folder holds another run and `resume` is not set, holds no run at all or links, is in use,
+            or holds a model whose training cannot be continued.
     """
     folder = folder_of(config)
-    holds_run = (folder / "config.yaml").is_file()
-    if folder.exists() and not (holds_run and config.resume) and not _is_free(folder):
+    holds_run, is_free = (folder / "config.yaml").is_file(), _is_free(folder)
+    if folder.exists() and not (holds_run and config.resume) and not is_free:
         hint = "continue it with resume=true or choose" if holds_run else "choose"
         raise ValueError(f"out_dir: {folder} already holds another run or other files; {hint} a new folder")
     folder.mkdir(parents=True, exist_ok=True)
     for path in folder.iterdir():
         if path.is_symlink():  # a folder that somebody else made could have us write anywhere
             raise ValueError(f"out_dir: {path} is a link; a run's folder holds files and folders of its own")
+    if (folder / "model.safetensors").exists() and not CheckpointFolder(folder / "checkpoints").is_begun:
+        raise ValueError(f"resume: {folder} holds a model but no checkpoint to continue from; choose a new out_dir")
     with claimed(folder):
         for path in (folder, *(folder / name for name in OWN_FOLDERS)):
             remove_leftovers(path)
         save_config(folder, config)
-        if not (folder / "overrides.json").exists():
+        if is_free or not (folder / "overrides.json").exists():
             write_json(folder / "overrides.json", list(HydraConfig.get().overrides.task))
         yield folder
 
@@ -164,5 +173,12 @@ def save_config(folder: Path, config: DictConfig) -> None:
 
 
 def _is_free(folder: Path) -> bool:
-    """Whether a folder is empty but for what a run killed at its very beginning leaves."""
-    return folder.is_dir() and all(path.name.startswith(TEMPORARY) for path in folder.iterdir())
+    """Whether a folder is empty but for what a run leaves that was refused, or killed, before its first record."""
+    if not folder.is_dir():
+        return False
+    return all(
+        path.name.startswith(TEMPORARY)
+        or path.name in ("config.yaml", "overrides.json")
+        or (path.name in OWN_FOLDERS and path.is_dir() and not any(path.iterdir()))
+        for path in folder.iterdir()
+    )

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from hydra_app import build, load_config, load_renderer, resolve_device, run_app
+from hydra_app import build, load_config, load_renderer, moved, resolve_device, run_app
 from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
 from dnerf.benchmarks.endpoint_rows import endpoint_rows
 from dnerf.cameras import Camera
-from dnerf.checks import check_choice, check_positive
+from dnerf.checks import check_choice
 from dnerf.data import SyntheticData
 from dnerf.deformations import Deformation
 from dnerf.deformations.folding import folding
@@ -27,7 +27,7 @@ from dnerf.motion_search import has_unknown_motion
 from dnerf.renderer import Renderer
 from dnerf.seen_matter import seen_matter
 from dnerf.tracks import render_tracks, seen_points
-from dnerf.video import FORMATS, write_frames, write_png
+from dnerf.video import FORMATS, check_film, check_fps, write_frames, write_png
 
 STRIP = 4
 """Pictures of the strip."""
@@ -35,16 +35,17 @@ STRIP = 4
 
 def main(config: DictConfig) -> None:
     """Load the run, choose and follow points, draw, and measure where the truth is known."""
-    for name in ("num_frames", "fps", "spacing", "every"):
-        check_positive(name, config[name])
-    for name in ("trail", "matter_rays"):
-        check_positive(name, config[name], allow_zero=True)
     check_choice("format", config.format, FORMATS)
+    check_fps(config.fps, config.format)
+    suffix = "" if config.format == "png" else f".{config.format}"
+    output = Path(config.output or Path(config.run) / "renders" / f"tracks{suffix}")
+    output = output if output.suffix else output.with_suffix(suffix)
+    if suffix:
+        check_film(output, config.format)
     if not 0 <= config.start <= 1:
         raise ValueError(f"start must be in [0, 1], got {config.start}")
     saved = load_config(config.run)
-    if config.data_root is not None:
-        saved.data.root = config.data_root
+    moved(saved, config.data_root)
     device = resolve_device(config.device)
     renderer = load_renderer(config.run, saved, device)
     data = build(saved.data)
@@ -55,8 +56,6 @@ def main(config: DictConfig) -> None:
     tracks, pictures = render_tracks(
         renderer, camera, points, config.start, times, trail=config.trail, every=config.every, chunk=chunk
     )
-    suffix = "" if config.format == "png" else f".{config.format}"
-    output = Path(config.output or Path(config.run) / "renders" / f"tracks{suffix}")
     frames = list(tqdm(pictures, total=-(-len(times) // config.every), unit="frame"))
     write_frames(frames, output, config.format, fps=config.fps)
     still = write_png(frames[-1], output.parent / f"{output.stem}_still.png")
@@ -97,7 +96,6 @@ def _camera(config: DictConfig, data: object, device: torch.device) -> Camera:
         raise ValueError(f"frame must be in 0..{len(frames) - 1}, got {config.frame}")
     intrinsics = frames.intrinsics
     if config.resolution is not None:
-        check_positive("resolution", config.resolution)
         height = round(config.resolution * intrinsics.height / intrinsics.width)
         intrinsics = intrinsics.resized(config.resolution, height)
     return Camera(intrinsics, frames.poses[config.frame].to(device), frames.near, frames.far)

@@ -13,14 +13,14 @@ from omegaconf import DictConfig, OmegaConf
 from reporting import evaluate_run, print_scores
 from run_folder import continued, in_box, opened, save_config
 
-from dnerf.box_check import BoxTooLarge
+from dnerf.box_check import BoxTooLarge, check_views
 from dnerf.checkpoints import save_weights
 from dnerf.data.frames import Frames
 from dnerf.data.source import DataSource
 from dnerf.distributed import Processes, started
 from dnerf.files import write_json
 from dnerf.logs import JsonLinesLog, Previews, TensorBoardLog, tensorboard_writer
-from dnerf.motion_search import MotionSearch
+from dnerf.motion_search import MotionSearch, has_unknown_motion
 from dnerf.provenance import commit, hardware
 from dnerf.renderer import Renderer
 from dnerf.run_state import CheckpointFolder
@@ -44,7 +44,10 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     model = _model(config, device)
     # Runs of before there was any have no such setting.
     search = None if config.get("motion_search") is None else build(config.motion_search)
+    for split in {config.evaluate_split, "val" if config.preview_every else None} - {None}:
+        data.check(split)
     frames = data.frames("train")  # after what can be refused in no time: exact frames are rendered first
+    check_views(frames, data.box)
     name = processes.from_first(lambda: str(held.enter_context(opened(config))).encode())
     assert name is not None
     folder = Path(name.decode())
@@ -129,6 +132,8 @@ def _fit(
 def _search_motion(search: MotionSearch, config: DictConfig, renderer: Renderer, frames: Frames) -> None:
     """Read off the trained field the motion that its deformation does not know, if there is any."""
     start = time.perf_counter()
+    if has_unknown_motion(renderer):
+        print("motion: looking for what the deformation does not move (motion_search)")
     found = search(renderer, frames, seed=config.seed, progress_bar=config.trainer.progress_bar)
     if found is not None:
         said = "found" if found.is_motion else "nothing found"
@@ -148,6 +153,7 @@ def _is_scored(folder: Path, config: DictConfig, training: dict[str, Any]) -> bo
     wanted = config.evaluate_frames
     return (
         known == training
+        and (folder / "model.safetensors").is_file()
         and metrics["split"] == config.evaluate_split
         and metrics["num_steps"] == training["num_steps"]
         and (wanted is None or metrics["num_frames"] == wanted)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dnerf.backgrounds import ConstantBackground
-from dnerf.box_check import BoxCheck, BoxTooLarge, reach, share_of_views, shows_outside
+from dnerf.box_check import BoxCheck, BoxTooLarge, check_views, reach, share_of_views, shows_outside
 from dnerf.cameras import Camera, Intrinsics, look_at, orbit_path
 from dnerf.compositing import FieldOutput
 from dnerf.data.frames import Frames
@@ -229,6 +229,16 @@ def test_an_opaque_pixel_looks_past_a_box_or_into_it() -> None:
     beyond = replace(with_opaque(2, 3, 3), near=0.5, far=1.0)
     assert shows_outside(beyond, cube)
     assert not shows_outside(views(), cube + 3)  # no alpha
+
+
+@pytest.mark.parametrize(
+    ("box", "near", "far"), [(((10, 10, 10), (11, 11, 11)), 2.0, 6.0), (((-1, -1, -1), (1, 1, 1)), 7.0, 9.0)]
+)
+def test_a_box_that_no_camera_sees_is_refused(box: tuple, near: float, far: float) -> None:
+    frames = replace(views(), near=near, far=far)
+    with pytest.raises(ValueError, match=rf"box must be seen by some camera between near {near:g} and far {far:g}"):
+        check_views(frames, torch.tensor(box, dtype=torch.float32))
+    check_views(views(), torch.tensor([[-1.0] * 3, [1.0] * 3]))
 
 
 def test_faces_that_cut_matter_are_named() -> None:

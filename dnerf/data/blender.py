@@ -102,6 +102,23 @@ def load_blender(
     return frames
 
 
+def check_blender(root: str | Path, split: str, max_frames: int = 10_000) -> None:
+    """Read a split's `transforms_<split>.json` and the headers of its images, none of their pixels.
+
+    Args:
+        root: the scene's folder.
+        split: see `load_blender`.
+        max_frames: more frames than this are refused.
+
+    Raises:
+        ValueError: as `load_blender` for all that this tells.
+    """
+    _check_split(split)
+    if not Path(root).is_dir():
+        raise ValueError(f"root must be a data set's folder, got {root}")
+    _common_header(read_manifest(Path(root), split, max_frames))
+
+
 def save_blender(frames_by_split: Mapping[str, Frames], root: str | Path) -> None:
     """Write a data set that `load_blender` and the field's other codebases read.
 

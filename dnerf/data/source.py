@@ -2,12 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from numbers import Real
+from pathlib import Path
 
 from torch import Tensor
 
 from dnerf.backgrounds import parse_color
-from dnerf.checks import as_box, check_choice, check_positive
-from dnerf.data.blender import load_blender
+from dnerf.checks import as_box, check_choice, check_positive, check_whole
+from dnerf.data.blender import check_blender, load_blender
 from dnerf.data.frames import Frames
 from dnerf.data.synthetic import random_views, render_frames
 from dnerf.scenes import AnalyticScene
@@ -29,6 +31,14 @@ class DataSource(ABC):
             ValueError: for another split or broken data.
         """
 
+    def check(self, split: str) -> None:
+        """Raise what `frames` would of a split that is not there, or is broken as far as can be seen in no time.
+
+        Raises:
+            ValueError: for another split or broken data.
+        """
+        check_choice("split", split, SPLITS)
+
     def _known(self, frames: Frames, split: str) -> Frames:
         """The frames of a split that may be seen: training frames up to `train_end`, all others whole.
 
@@ -44,7 +54,9 @@ class DataSource(ABC):
 
 
 def _check_train_end(train_end: float | None) -> None:
-    if train_end is not None and not 0 <= train_end <= 1:
+    if train_end is None:
+        return
+    if not isinstance(train_end, Real) or not 0 <= train_end <= 1:
         raise ValueError(f"train_end must be in [0, 1] or None, got {train_end}")
 
 
@@ -76,6 +88,11 @@ class BlenderData(DataSource):
         train_end: float | None = None,
     ) -> None:
         _check_train_end(train_end)
+        if not isinstance(root, str | Path):
+            raise ValueError(f"root must be a data set's folder, got {root!r}")
+        for name, plane in (("near", near), ("far", far)):
+            if plane is not None:
+                check_positive(name, plane, allow_zero=name == "near")
         self.train_end = train_end
         self.root = root
         self.resolution = resolution
@@ -91,6 +108,11 @@ class BlenderData(DataSource):
             self.root, split, self.resolution, near=self.near, far=self.far, pixel_origin=self.pixel_origin
         )
         return self._known(frames, split)
+
+    def check(self, split: str) -> None:
+        """Read a split's file and its images' headers, see `DataSource.check`."""
+        super().check(split)
+        check_blender(self.root, split)
 
 
 class SyntheticData(DataSource):
@@ -134,7 +156,9 @@ class SyntheticData(DataSource):
             ("num_val", num_val),
             ("num_test", num_test),
         ):
-            check_positive(name, value)
+            check_whole(name, value)
+        if not isinstance(seed, int):
+            raise ValueError(f"seed must be a whole number, got {seed!r}")
         self.train_end = train_end
         self.scene = scene
         self.resolution = resolution

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import as_box, check_positive, check_shape
+from dnerf.checks import as_box, check_positive, check_shape, check_whole
 from dnerf.compositing import FieldOutput
 from dnerf.deformations.base import check_one_time, check_positions_times
 from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
@@ -71,6 +71,8 @@ class GridField(RadianceField):
         check_positive("time_terms", time_terms)
         if window_end is not None and not 0 < window_end <= 1:
             raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
+        for resolution in resolutions:
+            check_whole("resolutions", resolution)
         corners = as_box(box)
         sides = corners[1] - corners[0]
         cells = [[max(1, round(r * float(s / sides.max()))) for s in sides] for r in resolutions]

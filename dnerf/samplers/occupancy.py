@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dnerf.cameras import Camera
-from dnerf.checks import check_positive
+from dnerf.checks import check_positive, check_whole
 from dnerf.compositing import FieldOutput, render_weights
 from dnerf.fields.base import RadianceField, ask_along
 from dnerf.fixed_size import placed
@@ -102,12 +102,15 @@ class OccupancySampler(OccupancyGrid):
             ("step_size", step_size),
             ("coarse_step", step_size if coarse_step is None else coarse_step),
             ("coarse_until", coarse_until),
+        ):
+            check_positive(name, value)
+        for name, count in (
             ("splits", splits),
             ("render_splits", splits if render_splits is None else render_splits),
             ("filter_joins", filter_joins),
             ("pad_to", pad_to),
         ):
-            check_positive(name, value)
+            check_whole(name, count)
         if coarse_until > 1:
             raise ValueError(f"coarse_until must be in (0, 1], got {coarse_until}")
         for name, value in (("split_weight", split_weight), ("min_weight", min_weight)):

@@ -156,6 +156,66 @@ def test_a_run_that_never_began_begins(tmp_path: Path, whole: Path, made: bool) 
     assert not list((tmp_path / "run").glob(".tmp-*"))
 
 
+def test_a_start_that_was_refused_is_in_nobodys_way(tmp_path: Path, whole: Path) -> None:
+    """Pictures without alpha want one colour behind them; what was written before that was known is no run."""
+    refused = run_script("train", *SETTINGS, "+data.background=white", "background=random", "out_dir=run", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "background: a random one needs frames with alpha" in refused.stderr
+    for more in ((), ("resume=true",)):
+        done = train(tmp_path, *more)
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / "run" / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+        given = json.loads((tmp_path / "run" / "overrides.json").read_text())
+        assert "background=random" not in given
+        shutil.rmtree(tmp_path / "run" / "checkpoints")
+        for path in (tmp_path / "run").iterdir():
+            if path.name not in ("config.yaml", "overrides.json"):
+                path.unlink() if path.is_file() else shutil.rmtree(path)
+
+
+def test_a_model_that_is_gone_is_written_again(tmp_path: Path, whole: Path) -> None:
+    shutil.copytree(whole, tmp_path / "run")
+    (tmp_path / "run" / "model.safetensors").unlink()
+    done = run_script("train", "out_dir=run", "resume=true", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+
+
+def test_a_model_without_checkpoints_is_not_trained_over(tmp_path: Path, whole: Path) -> None:
+    shutil.copytree(whole, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    before = (tmp_path / "run" / "model.safetensors").read_bytes()
+    done = run_script("train", "out_dir=run", "resume=true", "trainer.num_steps=1000", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "holds a model but no checkpoint to continue from" in done.stderr
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("evaluate_split=tets",), "evaluate_split must be one of train, val, test or null, got 'tets'"),
+        (("evaluate_frames=0",), "evaluate_frames must be a whole number of at least 1 or null, got 0"),
+        (("chunk=1.5",), "chunk must be a whole number of at least 1, got 1.5"),
+        (("data.box=[[10,10,10],[11,11,11]]",), "box must be seen by some camera between near 2 and far 6"),
+        (("trainer.betas=[0.9,2]",), "betas must be two numbers in [0, 1)"),
+        (("data_root=elsewhere", "resume=true"), "data_root must be null"),
+    ],
+)
+def test_what_would_be_wrong_in_the_end_is_refused_at_the_start(
+    tmp_path: Path, whole: Path, arguments: tuple[str, ...], named: str
+) -> None:
+    if "resume=true" in arguments:
+        shutil.copytree(whole, tmp_path / "run")
+        done = run_script("train", "out_dir=run", *arguments, cwd=tmp_path)
+    else:
+        done = train(tmp_path, *arguments)
+        assert not (tmp_path / "run").exists()
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert named in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -53,6 +54,7 @@ def call(script: str, *overrides: str) -> None:
     """A script's own work on a composed config, without the seconds that a process of its own takes to start."""
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         config = compose(script, list(overrides))
+    importlib.import_module("settings").check_settings(config, script)
     importlib.import_module(script).main(config)
 
 
@@ -233,8 +235,14 @@ def test_report_is_made_from_what_lies_in_the_run(work):
 
 WRONG = [
     ("render", ("run=run", "exact=maybe"), "exact must be true or false, got 'maybe'"),
-    ("render", ("run=run", "splits=0"), "splits must be a whole number of at least 1, got 0"),
-    ("render", ("run=run", "splits=1.5"), "splits must be a whole number of at least 1, got 1.5"),
+    ("render", ("run=run", "splits=0"), "splits must be a whole number of at least 1 or null, got 0"),
+    ("render", ("run=run", "splits=1.5"), "splits must be a whole number of at least 1 or null, got 1.5"),
+    ("render", ("run=run", "chunk=0"), "chunk must be a whole number of at least 1 or null, got 0"),
+    ("render", ("run=run", "num_frames=true"), "num_frames must be a whole number of at least 1, got True"),
+    ("render", ("run=run", "format=[]"), "format must be a text or a list of them"),
+    ("render", ("run=run", "format=gif", "fps=1000"), "fps must be at most 50 for gif"),
+    ("render", ("run=run", "data_root=[a]"), "data_root must be a text or null"),
+    ("render", ("run=run", "path=spiral", "path.elevations=[1]"), "path.elevations must be two angles"),
     ("render", ("run=run", "outputs=[sound]"), "outputs"),
     ("render", ("run=run", "outputs=[]"), "outputs"),
     ("render", ("run=run", "outputs=[compare]"), "compare"),
@@ -248,6 +256,11 @@ WRONG = [
     ("evaluate", ("run=run", "protocol=nerf"), "protocol"),
     ("evaluate", ("run=run", "lego_split=other"), "lego_split"),
     ("evaluate", ("run=run", "runs=[run]"), "run"),
+    ("evaluate", ("runs=run",), "runs must be a list of texts, got 'run'"),
+    ("evaluate", ("run=run", "temporal.num_frames=1"), "temporal.num_frames must be a whole number of at least 2"),
+    ("tracks", ("run=run", "every=1.5"), "every must be a whole number of at least 1, got 1.5"),
+    ("tracks", ("run=run", "output=x.gif"), "must be a file that ends in .mp4, got x.gif"),
+    ("tracks", ("run=run", "format=gif", "fps=1000"), "fps must be at most 50 for gif"),
     ("evaluate", ("runs=[run,nowhere]",), "nowhere"),
     ("evaluate", ("run=run", "lpips.enabled=true"), "lpips"),
     ("report", ("run=nowhere",), "nowhere"),
@@ -259,3 +272,44 @@ WRONG = [
 def test_wrong_input_is_named(work, script, arguments, named):
     with pytest.raises((ValueError, OSError, HydraException, OmegaConfBaseException), match=named):
         call(script, *arguments)
+
+
+def test_what_is_refused_leaves_nothing(work):
+    """Neither hidden folders of frames nor films."""
+    before = sorted(path.name for path in (work / "run").rglob("*"))
+    for arguments in (["outputs=[compare]"], ["chunk=-1"], ["fps=-1"], ["path=fixed", "path.frame=99"]):
+        with pytest.raises(ValueError, match=r"compare|chunk|fps|frame"):
+            call("render", "run=run", *arguments)
+    assert sorted(path.name for path in (work / "run").rglob("*")) == before
+
+
+def test_a_damaged_run_among_several_is_found_before_any_is_scored(work, capsys):
+    shutil.copytree(work / "run", work / "broken")
+    weights = work / "broken" / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="broken"):
+        call("evaluate", "runs=[run,broken]")
+    assert "dB" not in capsys.readouterr().out
+    shutil.rmtree(work / "broken")
+
+
+def test_a_scene_that_has_moved_is_found_where_it_is_now(work):
+    shutil.copytree(work / "run", work / "elder")
+    config = (work / "elder" / "config.yaml").read_text()
+    (work / "elder" / "config.yaml").write_text(config.replace("data/lego", "data/gone"))
+    for script, arguments in (("evaluate", ("run=elder", "plots=false")), ("train", ("out_dir=elder", "resume=true"))):
+        refused = run_script(script, *arguments, cwd=work)
+        assert refused.returncode == 2
+        assert "data/gone" in refused.stderr
+        done = run_script(script, *arguments, "data_root=data/lego", cwd=work)
+        assert done.returncode == 0, done.stderr
+    assert "root: data/lego" in (work / "elder" / "config.yaml").read_text()
+    shutil.rmtree(work / "elder")
+
+
+def test_a_split_that_cannot_be_scored_is_found_before_training(work):
+    shutil.copytree(work / "data" / "lego", work / "data" / "half")
+    (work / "data" / "half" / "transforms_test.json").unlink()
+    with pytest.raises(ValueError, match="transforms_test"):
+        call("train", "experiment=fast", "data=blender", "data.root=data/half", "out_dir=never", "data.resolution=24")
+    assert not (work / "never").exists()
