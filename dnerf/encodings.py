@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import check_choice, check_positive
+from dnerf.checks import check_choice, check_positive, check_whole
 from dnerf.geometry import check_last_axis
 
 FRAMES_OF_A_KNOT = 2
@@ -97,6 +97,7 @@ class TimeEncoding(nn.Module):
         super().__init__()
         if num_knots < 0 or num_knots == 1:
             raise ValueError(f"num_knots must be 0 or at least 2, got {num_knots}")
+        check_whole("num_knots", num_knots, allow_zero=True)
         check_positive("num_features", num_features)
         self.waves = SinusoidalEncoding(1, num_frequencies)
         self.knots = nn.Parameter(torch.zeros(num_knots, num_features)) if num_knots else None

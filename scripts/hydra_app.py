@@ -34,6 +34,7 @@ from dnerf.stopping import TrainingStopped
 
 WRONG_INPUT = 2
 USER_ERRORS = (ValueError, OSError, MemoryError, LostProcess, HydraException, OmegaConfBaseException)
+NO_MEMORY = "DefaultCPUAllocator"
 MAX_CONFIG_BYTES = 64 * 1024
 MAX_CONFIG_DEPTH = 40
 
@@ -106,7 +107,10 @@ def _one_line_errors() -> Iterator[None]:
             file=sys.stderr,
         )
         _leave(WRONG_INPUT)
-    except Exception:
+    except Exception as error:
+        if NO_MEMORY in str(error) and os.environ.get("DNERF_TRACEBACK") != "1":  # torch has no class for it
+            print(f"error: {one_line(error).partition(NO_MEMORY)[2].lstrip(': ')}", file=sys.stderr)
+            _leave(WRONG_INPUT)
         if not is_launched():
             raise
         traceback.print_exc()
@@ -199,6 +203,8 @@ def resolve_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError as error:
         raise ValueError(f"device must be auto, cpu, cuda or cuda:<index>, got {name!r}") from error
+    if device.type not in ("cpu", "cuda"):
+        raise ValueError(f"device must be auto, cpu, cuda or cuda:<index>, got {name!r}")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {name!r} was asked for, but torch sees no CUDA device")
     if device.type == "cuda" and device.index is None and is_launched():

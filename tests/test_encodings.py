@@ -163,6 +163,7 @@ def test_a_time_that_is_no_number_stays_none() -> None:
     [
         ((3, 1), "num_knots must be 0 or at least 2, got 1"),
         ((3, -2), "num_knots must be 0 or at least 2, got -2"),
+        ((3, 2.5), "num_knots must be a whole number, got 2.5"),
         ((3, 5, 0), "num_features must be > 0"),
     ],
 )

@@ -157,6 +157,8 @@ class SyntheticData(DataSource):
             ("num_test", num_test),
         ):
             check_whole(name, value)
+        if not isinstance(scene, AnalyticScene):
+            raise ValueError(f"scene must be an exact scene (scene=<name>), got {scene!r}")
         if not isinstance(seed, int):
             raise ValueError(f"seed must be a whole number, got {seed!r}")
         self.train_end = train_end

@@ -313,3 +313,10 @@ def test_a_split_that_cannot_be_scored_is_found_before_training(work):
     with pytest.raises(ValueError, match="transforms_test"):
         call("train", "experiment=fast", "data=blender", "data.root=data/half", "out_dir=never", "data.resolution=24")
     assert not (work / "never").exists()
+
+
+def test_a_picture_that_no_memory_holds_is_an_error_in_one_line(work):
+    done = run_script("render", "run=run", "path=fixed", "num_frames=1", "resolution=3000000", cwd=work)
+    assert done.returncode == 2
+    assert "can't allocate memory" in done.stderr
+    assert "Traceback" not in done.stderr
