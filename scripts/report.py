@@ -58,7 +58,7 @@ def _temporal(path: Path) -> dict[str, Any] | None:
         values = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: not a readable JSON file ({error})") from error
-    if not isinstance(values, dict) or "motion" not in values:
+    if not isinstance(values, dict) or not {"motion", "num_frames"} <= values.keys():
         raise ValueError(f"{path}: expected the scores of evaluate.py temporal.enabled=true")
     return values
 

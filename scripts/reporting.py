@@ -99,6 +99,9 @@ def read_training(folder: Path) -> dict[str, object]:
         raise ValueError(f"{path}: not a readable JSON file; did the training finish? ({error})") from error
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected a mapping, got {type(values).__name__}")
+    for name in ("train_seconds", "num_steps", "num_parameters"):
+        if not isinstance(values.get(name), int | float):
+            raise ValueError(f"{path}: {name} must be a number, got {values.get(name)!r}")
     return values
 
 

@@ -320,3 +320,23 @@ def test_a_picture_that_no_memory_holds_is_an_error_in_one_line(work):
     assert done.returncode == 2
     assert "can't allocate memory" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("script", "name", "content", "named"),
+    [
+        ("evaluate", "training.json", "{}", "training.json: train_seconds must be a number, got None"),
+        ("evaluate", "training.json", "[1]", "training.json: expected a mapping, got list"),
+        ("report", "temporal.json", '{"motion": 1}', "temporal.json: expected the scores of evaluate.py"),
+    ],
+)
+def test_facts_that_are_missing_are_named_before_anything_is_written(work, script, name, content, named):
+    shutil.copytree(work / "run", work / "odd")
+    (work / "odd" / name).write_text(content)
+    before = (work / "odd" / "metrics.json").read_bytes()
+    try:
+        with pytest.raises(ValueError, match=named):
+            call(script, "run=odd")
+        assert (work / "odd" / "metrics.json").read_bytes() == before
+    finally:
+        shutil.rmtree(work / "odd")
