@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torchdiffeq import odeint, odeint_adjoint
 
 from dnerf.checks import check_choice, check_positive
 
@@ -82,6 +81,8 @@ class Solver:
         """
         if not self.is_adaptive:
             return fixed_steps(self.name, right_hand_side, positions, self.num_steps)
+        from torchdiffeq import odeint  # with it comes scipy, a fifth of a second that fixed steps need not wait for
+
         return odeint(right_hand_side, positions, _unit_interval(positions), **self._settings(_worst_point))[-1]
 
     def solve_adjoint(self, right_hand_side: nn.Module, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -92,6 +93,8 @@ class Solver:
             state: tensors of any shapes, the first (..., 3).
         """
         settings = self._settings(lambda parts: _worst_point(parts[0]))
+        from torchdiffeq import odeint_adjoint
+
         solution = odeint_adjoint(right_hand_side, state, _unit_interval(state[0]), **settings)
         return tuple(part[-1] for part in solution)
 

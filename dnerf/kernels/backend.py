@@ -17,6 +17,10 @@ COMPILED_DTYPES = (torch.float32, torch.float64)
 # would not reach. The name is checked where it is used, so that a misspelt variable does not break the import.
 _selected = os.environ.get("DNERF_KERNELS", "auto")
 
+# Asked once, and not in a function that torch.compile would have to see through: marking one as constant loads all of
+# its compiler, most of a second.
+_HAS_TRITON = importlib.util.find_spec("triton") is not None
+
 
 def get_backend() -> str:
     """The selected backend's name, one of `BACKENDS`."""
@@ -82,10 +86,9 @@ def run_compiled(op: str, function: str, tensor: Tensor, *arguments: Any) -> Any
     return getattr(import_module(f"dnerf.kernels.{folder}.{op}"), function)(tensor, *arguments)
 
 
-@torch.compiler.assume_constant_result
 def has_triton() -> bool:
     """Whether Triton can be imported."""
-    return importlib.util.find_spec("triton") is not None
+    return _HAS_TRITON
 
 
 def _check_name(name: str) -> None:
