@@ -5,6 +5,7 @@ Operations look at where their tensors lie as CUDA's do: all in one place, but f
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 from unittest.mock import patch
 
@@ -12,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
-from torch.utils._pytree import tree_leaves, tree_map
 
 NAME = "elsewhere"
 MOVES = {"_to_copy", "copy_", "_copy_from", "copy"}  # between devices
@@ -51,9 +51,11 @@ class Elsewhere(Tensor):
 
 def _dispatched(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     name = function.overloadpacket.__name__
-    given = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+    given = list(_tensors((args, kwargs)))
     is_there = any(isinstance(x, Elsewhere) for x in given)
     wanted = kwargs.get("device")
+    if wanted is None and not is_there:
+        return function(*args, **kwargs)
     if wanted is not None:
         is_there = torch.device(wanted).type == NAME
     elif is_there and name not in MOVES:
@@ -63,14 +65,41 @@ def _dispatched(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
                 raise RuntimeError(f"{function}: a tensor {tuple(x.shape)} lies on the {x.device}, others {NAME}")
     elif name == "copy_":
         is_there = isinstance(args[0], Elsewhere)
-    held_args, held_kwargs = tree_map(lambda x: x.held if isinstance(x, Elsewhere) else x, (args, kwargs))
+    held_args, held_kwargs = _mapped(lambda x: x.held if isinstance(x, Elsewhere) else x, (args, kwargs))
     if is_there and wanted is not None:
         held_kwargs["device"] = torch.device("cpu")
     outputs = function(*held_args, **held_kwargs)
     if not is_there or name == "_local_scalar_dense":
         return outputs
-    outputs = tree_map(lambda x: Elsewhere(x) if isinstance(x, Tensor) else x, outputs)
-    return return_and_correct_aliasing(function, args, kwargs, outputs) if given else outputs
+    outputs = _mapped(Elsewhere, outputs)
+    return return_and_correct_aliasing(function, args, kwargs, outputs) if given and _aliases(function) else outputs
+
+
+@cache
+def _aliases(function: Any) -> bool:
+    """Whether an operation gives views of its arguments, or changes them."""
+    schema = function._schema
+    return any(part.alias_info is not None for part in (*schema.arguments, *schema.returns))
+
+
+def _tensors(node: Any) -> Iterator[Tensor]:
+    """The tensors in what operations are given, lists and mappings included (as torch's trees, which take longer)."""
+    if isinstance(node, Tensor):
+        yield node
+    elif isinstance(node, tuple | list):
+        for child in node:
+            yield from _tensors(child)
+    elif isinstance(node, dict):
+        yield from _tensors(list(node.values()))
+
+
+def _mapped(change: Callable[[Tensor], Tensor], node: Any) -> Any:
+    """The same with each tensor changed."""
+    if isinstance(node, Tensor):
+        return change(node)
+    if isinstance(node, tuple | list):
+        return type(node)([_mapped(change, child) for child in node])
+    return {key: _mapped(change, child) for key, child in node.items()} if isinstance(node, dict) else node
 
 
 class _Dispatch(TorchDispatchMode):
