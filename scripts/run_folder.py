@@ -47,10 +47,10 @@ def continued(config: DictConfig) -> DictConfig:
     Raises:
         ValueError: if `out_dir` is not given, or names the setting that differs from the run's own.
     """
-    if not config.resume:
-        return config
-    folder = folder_of(config)
-    if not (folder / "config.yaml").is_file():
+    folder = folder_of(config) if config.resume else None
+    if folder is None or not (folder / "config.yaml").is_file():
+        if config.data_root is not None:
+            raise ValueError(f"data_root must be null unless a run is continued, got {config.data_root}; set data.root")
         return config
     saved = load_config(str(folder))
     hydra = HydraConfig.get()
@@ -58,14 +58,14 @@ def continued(config: DictConfig) -> DictConfig:
     given = {override.get_key_element().lstrip("+~").partition("@")[0] for override in overrides}
     if _is_free(folder) and given - set(CHANGEABLE):  # it was refused, or stopped, before its first record
         return config
-    if config.data_root is not None:
-        moved(saved, config.data_root)
+    moved(saved, config.data_root)
     values = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     assert isinstance(values, DictConfig)
     fit = saved.get("box_fit")
     if fit is not None and values.data.box == fit.given:  # the run has found that less is enough
         values = in_box(values, saved.data.box, fit.seconds)
     if given & set(hydra.runtime.choices):  # an experiment or another group was named: all of it must agree
+        moved(values, config.data_root)
         _check_same(_leaves(saved), _leaves(values), folder)
         return values
     before, now = ({key: OmegaConf.select(node, key) for key in given} for node in (saved, values))
@@ -176,9 +176,7 @@ def _is_free(folder: Path) -> bool:
     """Whether a folder is empty but for what a run leaves that was refused, or killed, before its first record."""
     if not folder.is_dir():
         return False
-    return all(
-        path.name.startswith(TEMPORARY)
-        or path.name in ("config.yaml", "overrides.json")
-        or (path.name in OWN_FOLDERS and path.is_dir() and not any(path.iterdir()))
-        for path in folder.iterdir()
-    )
+    paths = [path for path in folder.iterdir() if not path.name.startswith(TEMPORARY)]
+    left = {path.name for path in paths if not path.is_dir() or any(path.iterdir())}
+    # A lone config.yaml may be anybody's.
+    return not left or left == {"config.yaml", "overrides.json"}

@@ -199,7 +199,8 @@ def test_a_model_without_checkpoints_is_not_trained_over(tmp_path: Path, whole: 
         (("chunk=1.5",), "chunk must be a whole number of at least 1, got 1.5"),
         (("data.box=[[10,10,10],[11,11,11]]",), "box must be seen by some camera between near 2 and far 6"),
         (("trainer.betas=[0.9,2]",), "betas must be two numbers in [0, 1)"),
-        (("data_root=elsewhere", "resume=true"), "data_root must be null"),
+        (("data_root=elsewhere", "resume=true"), "data_root must be null, this run's frames are of an exact scene"),
+        (("data_root=elsewhere",), "data_root must be null unless a run is continued"),
     ],
 )
 def test_what_would_be_wrong_in_the_end_is_refused_at_the_start(
@@ -225,11 +226,14 @@ def test_what_would_be_wrong_in_the_end_is_refused_at_the_start(
         (("resume=true",), "needs out_dir"),
         (("out_dir=run", *SETTINGS), "resume=true"),
         (("resume=true", "out_dir=other", *SETTINGS), "other"),
+        (("out_dir=lone", *SETTINGS), "lone already holds"),
     ],
 )
 def test_what_cannot_be_continued_is_refused_in_one_line(whole: Path, arguments: tuple[str, ...], named: str) -> None:
     (whole.parent / "other").mkdir(exist_ok=True)
     (whole.parent / "other" / "thesis.tex").write_text("mine")
+    (whole.parent / "lone").mkdir(exist_ok=True)
+    (whole.parent / "lone" / "config.yaml").write_text("mine: true")
     before = {path: path.stat().st_mtime_ns for path in whole.parent.rglob("*")}
     done = run_script("train", *arguments, cwd=whole.parent)
     assert done.returncode == 2, done.stderr
