@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from preload import load_everything
 from test_body_search import a_renderer, frames_of_two_balls, wrong_where_matter_is
 from torch import Tensor
 
@@ -214,6 +215,7 @@ def main() -> None:
     parser.add_argument("--mishaps", action="store_true", help="kill, hang and stop a process as well")
     given = parser.parse_args()
     torch.set_num_threads(1)  # comparing large tensors begins threads otherwise, and forks of such a process hang
+    load_everything()
     result: dict[str, Any] = {model: compare(model, given.steps, given.processes) for model in MODELS}
     if given.mishaps:
         result["killed"] = mishap(signal.SIGKILL, 1, 60)

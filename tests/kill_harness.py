@@ -18,6 +18,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from preload import load_everything
+
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = (
     "experiment=demo", "data.resolution=24", "data.num_train=4", "data.num_val=1", "data.num_test=1",
@@ -115,14 +117,7 @@ def main() -> int:
     parser.add_argument("--kills-per-run", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    import hydra  # noqa: F401
-    import numba  # noqa: F401
-    import torchmetrics  # noqa: F401
-
-    import dnerf.data
-    import dnerf.evaluation
-    import dnerf.logs  # noqa: F401
-
+    load_everything()
     chance = random.Random(arguments.seed)
     endings: dict[str, int] = {}
     failures = 0

@@ -26,7 +26,8 @@ TINY = [
     "trainer.num_steps=12", "trainer.num_rays=256", "trainer.target_samples=1024", "trainer.log_every=4",
     "trainer.checkpoint_every=8", "trainer.progress_bar=false", "trainer.box_check.every=4",
     "trainer.missing_matter.share=1.0e-6", "trainer.missing_matter.every=1", "trainer.missing_matter.min_steps=4",
-    "sampler.resolution=24", "sampler.num_probes=2048", "renderer.field.frame_lattice.resolution=16",
+    "field.resolutions=[8,16,24]", "sampler.resolution=24", "sampler.num_probes=2048",
+    "renderer.field.frame_lattice.resolution=16",
     "renderer.field.baking.resolution=24", "field.density_shift=-4",  # thin, so that matter is lacking
 ]  # fmt: skip
 SHORT_SEARCH = ["motion_search.num_steps=3", "motion_search.num_rays=200"]

@@ -182,7 +182,7 @@ def test_modes_of_shared_parts_are_left_alone() -> None:
     assert field.deformation.training
 
 
-@pytest.mark.parametrize("time_terms", [1, 4])
+@pytest.mark.parametrize("time_terms", [1, 3])
 def test_networks_in_bfloat16_are_baked_too(time_terms: int) -> None:
     torch.manual_seed(0)
     field = GridField(BOX, (8, 16), 4, hidden_features=16, num_layers=1, time_terms=time_terms)
@@ -254,7 +254,7 @@ def test_contents_beyond_half_precision_stay_finite_and_no_number_stays_none() -
 def test_a_field_with_more_to_say_answers_itself_and_its_contents_are_kept() -> None:
     torch.manual_seed(0)
     volumes = SpaceTimeVolumes(BOX, (4,), (4,), num_features=2)
-    field = GridField(BOX, (8, 16), 4, hidden_features=16, time_terms=2, space_time=volumes)
+    field = GridField(BOX, (8, 16), 4, hidden_features=16, time_terms=3, space_time=volumes)
     for table in volumes.tables:
         torch.nn.init.normal_(table)
     kept, x, times = Baking(BOX, 128).bake(field), points(200, dtype=torch.float32), torch.rand(200)

@@ -90,15 +90,10 @@ def fork(request: dict[str, Any]) -> int:
 
 
 def serve() -> None:
-    import hydra  # noqa: F401
-    import numba  # noqa: F401
-    import torchmetrics  # noqa: F401
+    sys.path.insert(0, str(ROOT / "tests"))
+    from preload import load_everything
 
-    import dnerf.data
-    import dnerf.evaluation
-    import dnerf.logs
-    import dnerf.training  # noqa: F401
-
+    load_everything()
     for line in sys.stdin:
         request = json.loads(line)
         if "wait" in request:

@@ -16,7 +16,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
-from launcher import ROOT, run_script
+from launcher import ROOT, Run, run_script
 from omegaconf.errors import OmegaConfBaseException
 from test_scripts import TINY
 
@@ -65,14 +65,13 @@ def films(folder: Path) -> dict[str, bytes]:
 def test_a_killed_rendering_goes_on_and_gives_the_same_bytes(work, capsys):
     arguments = ("run=run", "path=orbit", "num_frames=16", "fps=10", "format=[mp4,npz]", "outputs=[rgb,depth]")
     call("render", *arguments, "output=whole/film")
-    command = [sys.executable, str(ROOT / "scripts" / "render.py"), *arguments, "output=killed/film"]
-    with subprocess.Popen(command, cwd=work, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
-        deadline = time.monotonic() + 120
-        while len(list((work / "killed").glob(".film.*/frame_*.npz"))) < 4:
-            assert process.poll() is None, "it was over before it could be killed"
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-        process.send_signal(signal.SIGKILL)
+    rendering = Run("render", *arguments, "output=killed/film", cwd=work)
+    deadline = time.monotonic() + 120
+    while len(list((work / "killed").glob(".film.*/frame_*.npz"))) < 4:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    os.kill(rendering.pid, signal.SIGKILL)
+    assert rendering.wait().returncode == -signal.SIGKILL, "it was over before it could be killed"
     finished = list((work / "killed").glob(".film.*/frame_*.npz"))
     assert 4 <= len(finished) < 16
     assert not (work / "killed" / "film.mp4").exists()
