@@ -9,15 +9,12 @@ CONF = Path(__file__).resolve().parents[1] / "conf"
 
 def load_everything() -> None:
     """Load it; nothing that starts threads, which a forked child would lack."""
-    import torch._dynamo
-    import torchmetrics
     from hydra import compose, initialize_config_dir
 
-    import dnerf
-    import dnerf.kernels.cpu
-
-    for package in (dnerf, dnerf.kernels.cpu):
-        for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-            importlib.import_module(module.name)
+    for name in ("torch._dynamo", "torchmetrics", "dnerf", "dnerf.kernels.cpu"):
+        module = importlib.import_module(name)
+        if name.startswith("dnerf"):
+            for part in pkgutil.iter_modules(module.__path__, f"{name}."):
+                importlib.import_module(part.name)
     with initialize_config_dir(str(CONF), version_base="1.3"):
         compose("train")

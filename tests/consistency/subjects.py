@@ -52,7 +52,7 @@ def exact(name: str) -> Renderer:
     return Renderer(scene, ExactSampler(scene))
 
 
-def camera_rays(size: int = 14) -> Rays:
+def camera_rays(size: int = 10) -> Rays:
     """Rays of a small picture, in double precision so that tiny steps of time are what they say."""
     camera = Camera(Intrinsics.from_angle(size, size, 0.6), look_at((3.5, 0.6, 1.7)))
     return camera.rays(0.0)

@@ -57,7 +57,13 @@ def test_all_bricks_together_are_a_dense_grid(reference):
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.tuples(*[st.integers(1, 4)] * 3), st.floats(0, 1), st.sampled_from([1, 3, 4]), st.integers(0, 200), st.integers(0, 99))
+@given(
+    shape=st.tuples(*[st.integers(1, 4)] * 3),
+    share=st.floats(0, 1),
+    num_features=st.sampled_from([1, 3, 4]),  # each compiles anew
+    count=st.integers(0, 200),
+    seed=st.integers(0, 99),
+)
 def test_numba_equals_reference(shape, share, num_features, count, seed):
     slots, bricks = lattice(shape, round(share * shape[0] * shape[1] * shape[2]), num_features, seed=seed)
     positions = places(count, shape, seed)
