@@ -14,7 +14,7 @@ OPTIONS = {"step": 0.05, "splits": 1, "min_weight": 0.0, "split_weight": 0.0}
 OPTIONS |= {"cells_per_unit": PER_UNIT, "log_shift": 1.0}
 
 
-def tables(seed=0, known=1.0, bricks=1.0, share=0.3, num_terms=2, reach=0.15, cells=(5, 4, 6), adds=False):
+def tables(seed=0, known=1.0, bricks=1.0, share=0.3, num_terms=3, reach=0.15, cells=(5, 4, 6), adds=False):
     """A scene in which shares of the vertices and bricks exist, and whose lattice may add to what bricks hold."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -39,7 +39,7 @@ def tables(seed=0, known=1.0, bricks=1.0, share=0.3, num_terms=2, reach=0.15, ce
         low=BOX[0],
         sides=BOX[1] - BOX[0],
         slots=slots,
-        bricks=torch.randn(len(chosen), VERTICES, 4 * num_terms, generator=generator) * 2,
+        bricks=(torch.randn(len(chosen), VERTICES, 4 * num_terms, generator=generator) * 2).half(),
         brick_low=BOX[0] - 0.2,
         waves=torch.randn(num_terms, generator=generator),
     )
@@ -233,8 +233,8 @@ def test_op_is_registered_properly(adds):
         ({"skips": torch.zeros(1, 1, 1)}, "skips must have shape"),
         ({"is_known": torch.zeros(1, 4, 4, dtype=torch.bool)}, "is_known must be bool of three axes of at least 2"),
         ({"slots": torch.zeros(0, 2, 2, dtype=torch.int64)}, "slots must be int64"),
-        ({"waves": torch.zeros(2, dtype=torch.float64)}, "waves must be float32"),
-        ({"bricks": torch.zeros(1, VERTICES, 8).bfloat16()}, "bricks must be float32 or float16"),
+        ({"waves": torch.zeros(3, dtype=torch.float64)}, "waves must be float32"),
+        ({"bricks": torch.zeros(1, VERTICES, 12).bfloat16()}, "bricks must be float32 or float16"),
     ],
 )
 def test_wrong_tables_are_refused(wrong, message):
