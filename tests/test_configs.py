@@ -1,5 +1,6 @@
 """Every config composes, instantiates and takes a step."""
 
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -28,7 +29,9 @@ def names(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
+@cache
 def composed(*overrides: str) -> DictConfig:
+    """A training's config; the same one for the same overrides, so leave it as it is."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("train", [*overrides, *TINY])
 
@@ -113,7 +116,6 @@ def test_blender_data_reads_what_make_dataset_writes(tmp_path):
 
     source = SyntheticData(make_scene("static"), 12, num_train=2, num_val=1, num_test=1)
     save_blender({split: source.frames(split) for split in ("train", "val", "test")}, tmp_path / "scene")
-    config = composed("data=synthetic")
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("train", ["data=blender", f"data.root={tmp_path / 'scene'}", "data.resolution=null"])
     frames = instantiate(config.data, _convert_="all").frames("train")

@@ -80,7 +80,7 @@ def to_world(scene: AnalyticScene, local: Tensor, owners: Tensor, times: Tensor)
 
 @pytest.mark.parametrize("make_rays", [random_rays, rays_within])
 def test_pictures_agree_with_brute_force(scene: AnalyticScene, make_rays) -> None:
-    rays = make_rays(4)
+    rays = make_rays(6)
     rendering = render(scene, rays)
     assert (rendering.opacity > 0).any()
     for i in range(len(rays)):
