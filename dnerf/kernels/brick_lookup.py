@@ -6,6 +6,7 @@ from torch import Tensor
 from dnerf.geometry import cube_corners
 
 from .backend import choose, run_compiled
+from .op import op
 
 BRICK_BITS = 3
 BRICK = 1 << BRICK_BITS
@@ -64,7 +65,7 @@ def brick_lookup_reference(positions: Tensor, slots: Tensor, bricks: Tensor) -> 
     return torch.where(known[:, None], (weights[..., None] * values).sum(1), 0), known
 
 
-@torch.library.custom_op("dnerf::brick_lookup", mutates_args=())
+@op("brick_lookup")
 def _brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tensor, Tensor]:
     return run_compiled("brick_lookup", "brick_lookup", positions, slots, bricks)
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from .backend import choose, run_compiled
+from .op import op
 
 HASH_PRIMES = (1, 2654435761, 805459861)
 
@@ -143,22 +144,22 @@ def grid_encode_reference(positions: Tensor, table: Tensor, levels: GridLevels) 
     return torch.cat(features, -1)
 
 
-@torch.library.custom_op("dnerf::grid_encode", mutates_args=())
+@op("grid_encode")
 def _grid_encode(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "forward", positions, table, cells, max_rows)
 
 
-@torch.library.custom_op("dnerf::grid_encode_rounded", mutates_args=())
+@op("grid_encode_rounded")
 def _grid_encode_rounded(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "forward_rounded", positions, table, cells, max_rows)
 
 
-@torch.library.custom_op("dnerf::grid_encode_grad_table", mutates_args=())
+@op("grid_encode_grad_table")
 def _grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "grad_table", grad, positions, table, cells, max_rows)
 
 
-@torch.library.custom_op("dnerf::grid_encode_grad_positions", mutates_args=())
+@op("grid_encode_grad_positions")
 def _grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "grad_positions", grad, positions, table, cells, max_rows)
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from .backend import choose, run_compiled
+from .op import op
 from .skip_distances import BLOCK_BITS, blocks_shape
 
 
@@ -208,7 +209,7 @@ def interval_ranges(
     return enter, leave, first, torch.where(hit, (length / step).ceil() + 3, 0)
 
 
-@torch.library.custom_op("dnerf::march", mutates_args=())
+@op("march")
 def _march(
     origins: Tensor,
     directions: Tensor,

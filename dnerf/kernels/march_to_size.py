@@ -7,6 +7,7 @@ from dnerf.fixed_size import fit
 
 from .backend import choose, run_compiled
 from .march import MarchedSamples, check_march, march
+from .op import op
 
 
 @torch.no_grad()
@@ -66,7 +67,7 @@ def fitted(marched: MarchedSamples, size: int) -> tuple[MarchedSamples, Tensor]:
     return MarchedSamples(starts, ends, chosen.rays, chosen.offsets), chosen.wanted
 
 
-@torch.library.custom_op("dnerf::march_to_size", mutates_args=())
+@op("march_to_size")
 def _march_to_size(
     occupancy: Tensor, rays: list[Tensor], aabb: Tensor, step: Tensor, size: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from .backend import choose, run_compiled
+from .op import op
 from .packed_weights import check_offsets
 
 
@@ -51,17 +52,17 @@ def packed_sum_reference(values: Tensor, weights: Tensor | None, offsets: Tensor
     return sums.index_add(0, rays, weighted.double()).to(weighted.dtype)
 
 
-@torch.library.custom_op("dnerf::packed_sum", mutates_args=())
+@op("packed_sum")
 def _packed_sum(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tensor:
     return run_compiled("packed", "sums", values, weights, offsets)
 
 
-@torch.library.custom_op("dnerf::packed_sum_grad_values", mutates_args=())
+@op("packed_sum_grad_values")
 def _grad_values(grad: Tensor, weights: Tensor | None, offsets: Tensor, num_samples: int) -> Tensor:
     return run_compiled("packed", "grad_values", grad, weights, offsets, num_samples)
 
 
-@torch.library.custom_op("dnerf::packed_sum_grad_weights", mutates_args=())
+@op("packed_sum_grad_weights")
 def _grad_weights(grad: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
     return run_compiled("packed", "grad_weights", grad, values, offsets)
 

@@ -11,6 +11,7 @@ from .backend import choose, run_compiled
 from .brick_lookup import BRICK, VERTICES, brick_lookup_reference
 from .grid_encode import GridLevels, grid_encode_reference
 from .march import kept_intervals
+from .op import op
 from .shade import MOST_LOG_DENSITY
 from .skip_distances import blocks_shape
 
@@ -253,7 +254,7 @@ def trace_reference(
     return states, numbers, (vertices & ~is_known).reshape(-1), wanted
 
 
-@torch.library.custom_op("dnerf::trace", mutates_args=())
+@op("trace")
 def _trace(
     numbers: Tensor, rays: list[Tensor], tables: list[Tensor], splits: int, scalars: list[float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
