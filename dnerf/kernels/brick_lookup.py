@@ -65,7 +65,7 @@ def brick_lookup_reference(positions: Tensor, slots: Tensor, bricks: Tensor) -> 
     return torch.where(known[:, None], (weights[..., None] * values).sum(1), 0), known
 
 
-@op("brick_lookup")
+@op("dnerf::brick_lookup")
 def _brick_lookup(positions: Tensor, slots: Tensor, bricks: Tensor) -> tuple[Tensor, Tensor]:
     return run_compiled("brick_lookup", "brick_lookup", positions, slots, bricks)
 

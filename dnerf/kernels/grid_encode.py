@@ -144,22 +144,22 @@ def grid_encode_reference(positions: Tensor, table: Tensor, levels: GridLevels) 
     return torch.cat(features, -1)
 
 
-@op("grid_encode")
+@op("dnerf::grid_encode")
 def _grid_encode(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "forward", positions, table, cells, max_rows)
 
 
-@op("grid_encode_rounded")
+@op("dnerf::grid_encode_rounded")
 def _grid_encode_rounded(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "forward_rounded", positions, table, cells, max_rows)
 
 
-@op("grid_encode_grad_table")
+@op("dnerf::grid_encode_grad_table")
 def _grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "grad_table", grad, positions, table, cells, max_rows)
 
 
-@op("grid_encode_grad_positions")
+@op("dnerf::grid_encode_grad_positions")
 def _grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     return run_compiled("grid_encode", "grad_positions", grad, positions, table, cells, max_rows)
 

@@ -209,7 +209,7 @@ def interval_ranges(
     return enter, leave, first, torch.where(hit, (length / step).ceil() + 3, 0)
 
 
-@op("march")
+@op("dnerf::march")
 def _march(
     origins: Tensor,
     directions: Tensor,

@@ -67,7 +67,7 @@ def fitted(marched: MarchedSamples, size: int) -> tuple[MarchedSamples, Tensor]:
     return MarchedSamples(starts, ends, chosen.rays, chosen.offsets), chosen.wanted
 
 
-@op("march_to_size")
+@op("dnerf::march_to_size")
 def _march_to_size(
     occupancy: Tensor, rays: list[Tensor], aabb: Tensor, step: Tensor, size: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -7,25 +7,26 @@ import torch
 
 
 class Op:
-    """An operation `torch.ops.dnerf.<name>` that returns new tensors and changes none of its arguments.
+    """An operation of `torch.ops` that returns new tensors and changes none of its arguments.
 
     What `torch.library.custom_op` makes would load all of `torch.compile` when it is first called, a second that
     showing a picture can do without, and would take 10 microseconds more a call.
 
     Args:
-        name: of the operation.
+        name: of the operation, as in "dnerf::march", which is `torch.ops.dnerf.march`.
         function: what it does, on any device; its type hints are the operation's schema.
     """
 
     def __init__(self, name: str, function: Callable[..., Any]) -> None:
-        self.name = f"dnerf::{name}"
+        self.name = name
         schema = torch.library.infer_schema(function, mutates_args=())
         torch.library.define(self.name, schema, tags=(torch.Tag.pt2_compliant_tag,))
         torch.library.impl(self.name, "default", function)
         self._setup_context: Callable[..., None] | None = None
         self._gradients: Callable[..., Any] | None = None
         torch.library.register_autograd(self.name, self._backward, setup_context=self._set_up)
-        self._overload = getattr(torch.ops.dnerf, name).default
+        space, own_name = name.split("::")
+        self._overload = getattr(getattr(torch.ops, space), own_name).default
 
     def __call__(self, *arguments: Any) -> Any:
         return self._overload(*arguments)

@@ -52,17 +52,17 @@ def packed_sum_reference(values: Tensor, weights: Tensor | None, offsets: Tensor
     return sums.index_add(0, rays, weighted.double()).to(weighted.dtype)
 
 
-@op("packed_sum")
+@op("dnerf::packed_sum")
 def _packed_sum(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tensor:
     return run_compiled("packed", "sums", values, weights, offsets)
 
 
-@op("packed_sum_grad_values")
+@op("dnerf::packed_sum_grad_values")
 def _grad_values(grad: Tensor, weights: Tensor | None, offsets: Tensor, num_samples: int) -> Tensor:
     return run_compiled("packed", "grad_values", grad, weights, offsets, num_samples)
 
 
-@op("packed_sum_grad_weights")
+@op("dnerf::packed_sum_grad_weights")
 def _grad_weights(grad: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
     return run_compiled("packed", "grad_weights", grad, values, offsets)
 

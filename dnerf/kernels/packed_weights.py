@@ -56,12 +56,12 @@ def check_offsets(offsets: Tensor) -> None:
         raise ValueError(f"offsets must be int64 of shape (R + 1,), got {offsets.dtype} {tuple(offsets.shape)}")
 
 
-@op("packed_weights")
+@op("dnerf::packed_weights")
 def _packed_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     return run_compiled("packed", "weights", optical_depth, offsets)
 
 
-@op("packed_weights_grad")
+@op("dnerf::packed_weights_grad")
 def _packed_weights_grad(grad: Tensor, optical_depth: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
     return run_compiled("packed", "grad_optical_depth", grad, optical_depth, weights, offsets)
 

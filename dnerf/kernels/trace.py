@@ -254,7 +254,7 @@ def trace_reference(
     return states, numbers, (vertices & ~is_known).reshape(-1), wanted
 
 
-@op("trace")
+@op("dnerf::trace")
 def _trace(
     numbers: Tensor, rays: list[Tensor], tables: list[Tensor], splits: int, scalars: list[float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:

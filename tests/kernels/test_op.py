@@ -11,7 +11,7 @@ from torch import Tensor
 from dnerf.kernels.op import Op, op
 
 
-@op("double_for_a_test")
+@op("kernels_for_a_test::double")
 def double(x: Tensor, factors: list[float]) -> Tensor:
     return 2 * x * factors[0]
 
@@ -21,7 +21,7 @@ def _(x: Tensor, factors: list[float]) -> Tensor:
     return torch.empty_like(x)
 
 
-@op("halved_for_a_test")
+@op("kernels_for_a_test::halved")
 def halved(x: Tensor) -> Tensor:
     return x / 2
 
@@ -37,17 +37,17 @@ def test_it_is_registered_under_its_name_and_has_gradients() -> None:
     assert isinstance(double, Op)
     x = torch.tensor([1.0, -2.0], requires_grad=True)
     y = double(x, [3.0])
-    assert torch.equal(torch.ops.dnerf.double_for_a_test(x, [3.0]), y)
+    assert torch.equal(torch.ops.kernels_for_a_test.double(x, [3.0]), y)
     y.sum().backward()
     assert x.grad is not None
     assert x.grad.tolist() == [6.0, 6.0]
-    torch.library.opcheck(torch.ops.dnerf.double_for_a_test, (x, [3.0]))
+    torch.library.opcheck(torch.ops.kernels_for_a_test.double, (x, [3.0]))
 
 
 def test_without_a_formula_gradients_are_refused() -> None:
     y = halved(torch.ones(2, requires_grad=True))
     assert y.tolist() == [0.5, 0.5]
-    with pytest.raises(RuntimeError, match="dnerf::halved_for_a_test has no autograd formula"):
+    with pytest.raises(RuntimeError, match="kernels_for_a_test::halved has no autograd formula"):
         y.sum().backward()
 
 
