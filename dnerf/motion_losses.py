@@ -225,23 +225,29 @@ class FoldingLoss(VolumeLoss):
 class SteadyMatterLoss(DeformationLoss):
     """Squared change of matter that is carried along: of its opacity and colour, between a ray's time and another.
 
-    For a canonical field that may change with time: `(a(t) - a(t'))^2 + |rgb(t) - rgb(t')|^2` with a the opacity
+    For a canonical field that may change with time: `(a(t) - a(t'))^2 + color |rgb(t) - rgb(t')|^2` with a the opacity
     `1 - exp(-density length)`, t a sample's time and t' any other. What changes in canonical space can explain by
     itself whatever motion would, so motion is found only if change has a price. No gradient reaches the deformation.
 
     Args:
         weight: factor of the term.
         num_points: see `DeformationLoss`.
-        length: of the intervals whose opacity is meant, in world units.
+        length: of the intervals whose opacity is meant, in world units; over long ones matter may grow denser or
+            thinner, as long as it hides what lies behind.
+        color: factor of changes of colour, >= 0; 0 for opacity alone.
 
     Raises:
-        ValueError: as `DeformationLoss`, and for a length that is not positive.
+        ValueError: as `DeformationLoss`, for a length that is not positive, or a negative factor.
     """
 
-    def __init__(self, weight: float = 3e-4, num_points: int = 512, *, length: float = 0.02) -> None:
+    def __init__(
+        self, weight: float = 3e-4, num_points: int = 512, *, length: float = 0.02, color: float = 1.0
+    ) -> None:
         super().__init__(weight, num_points)
         check_positive("length", length)
+        check_positive("color", color, allow_zero=True)
         self.length = length
+        self.color = color
 
     def penalty(self, canonical: RadianceField, points: MotionPoints) -> Tensor:
         """Squared change of opacity and of the three colours, each seen from some direction."""
@@ -257,7 +263,8 @@ class SteadyMatterLoss(DeformationLoss):
         here, there = (
             torch.cat([-torch.expm1(-self.length * output.density)[:, None], output.rgb], dim=-1) for output in outputs
         )
-        return (here - there).square().sum(-1)
+        changes = (here - there).square()
+        return changes[:, 0] + self.color * changes[:, 1:].sum(-1)
 
     def _subject(self, renderer: Renderer) -> RadianceField:
         super()._subject(renderer)

@@ -264,9 +264,9 @@ class Changing(RadianceField):
         return FieldOutput(self.density(positions, times), red)
 
 
-def steady(canonical: RadianceField, count: int = 5000) -> Tensor:
+def steady(canonical: RadianceField, count: int = 5000, color: float = 1.0) -> Tensor:
     renderer = Renderer(DeformedField(Linear(torch.eye(3)), canonical), StratifiedSampler(4))
-    return SteadyMatterLoss(1.0, count, length=0.1)(rendering(count), torch.zeros(8, 3), renderer)
+    return SteadyMatterLoss(1.0, count, length=0.1, color=color)(rendering(count), torch.zeros(8, 3), renderer)
 
 
 @pytest.mark.parametrize("options", [{"time_terms": 3}, {"time_terms": 3, "view_degree": 1}, {"time_frequencies": 2}])
@@ -289,6 +289,14 @@ def test_change_costs_the_mean_square_between_two_random_times() -> None:
     assert loss.item() == pytest.approx((0.6**2 + 0.9**2) / 6, rel=0.05)
     loss.backward()
     torch.testing.assert_close(canonical.strength.grad, canonical.strength.detach() / 3, rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize("color", [0.0, 0.25])
+def test_colours_may_change_at_another_price_than_opacity(color: float) -> None:
+    loss = steady(Changing(0.6, 0.9), color=color)
+    assert loss.item() == pytest.approx((0.6**2 + color * 0.9**2) / 6, rel=0.05)
+    with pytest.raises(ValueError, match="color must be >= 0"):
+        SteadyMatterLoss(color=-0.1)
 
 
 def test_the_price_of_change_does_not_move_anything() -> None:
