@@ -5,12 +5,14 @@ from typing import Any
 
 import torch
 
+TAGS = (torch.Tag.pt2_compliant_tag,)  # as `custom_op` gives them: shapes and gradients hold under torch.compile
+
 
 class Op:
     """An operation of `torch.ops` that returns new tensors and changes none of its arguments.
 
-    What `torch.library.custom_op` makes would load all of `torch.compile` when it is first called, a second that
-    showing a picture can do without, and would take 10 microseconds more a call.
+    What `torch.library.custom_op` makes does the same, but loads all of `torch.compile` when it is first called, most
+    of a second that showing a picture can do without, and goes through more Python at every call.
 
     Args:
         name: of the operation, as in "dnerf::march", which is `torch.ops.dnerf.march`.
@@ -19,12 +21,11 @@ class Op:
 
     def __init__(self, name: str, function: Callable[..., Any]) -> None:
         self.name = name
-        schema = torch.library.infer_schema(function, mutates_args=())
-        torch.library.define(self.name, schema, tags=(torch.Tag.pt2_compliant_tag,))
-        torch.library.impl(self.name, "default", function)
+        self._gradients: Callable[..., Any] = self._refuse
         self._setup_context: Callable[..., None] | None = None
-        self._gradients: Callable[..., Any] | None = None
-        torch.library.register_autograd(self.name, self._backward, setup_context=self._set_up)
+        torch.library.define(name, torch.library.infer_schema(function, mutates_args=()), tags=TAGS)
+        torch.library.impl(name, "default", function)
+        torch.library.register_autograd(name, self._backward, setup_context=self._set_up)
         space, own_name = name.split("::")
         self._overload = getattr(getattr(torch.ops, space), own_name).default
 
@@ -45,9 +46,10 @@ class Op:
             self._setup_context(ctx, inputs, output)
 
     def _backward(self, ctx: Any, *gradients: Any) -> Any:
-        if self._gradients is None:
-            raise RuntimeError(f"{self.name} has no autograd formula registered: it is not differentiable")
         return self._gradients(ctx, *gradients)
+
+    def _refuse(self, ctx: Any, *gradients: Any) -> Any:
+        raise RuntimeError(f"{self.name} has no autograd formula registered: it is not differentiable")
 
 
 def op(name: str) -> Callable[[Callable[..., Any]], Op]:

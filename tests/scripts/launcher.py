@@ -90,7 +90,7 @@ def fork(request: dict[str, Any]) -> int:
 
 
 def serve() -> None:
-    sys.path.insert(0, str(ROOT / "tests"))
+    sys.path[0] = str(ROOT / "tests")  # a child has its script's folder there
     from preload import load_everything
 
     load_everything()
