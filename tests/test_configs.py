@@ -60,7 +60,17 @@ def test_motion_losses_join_the_flow(loss):
     config = composed("experiment=flow", f"+trainer/losses={loss}", "data.train_end=0.8")
     data = instantiate(config.data, _convert_="all")
     trainer = instantiate(config.trainer, _convert_="all")
-    own = {"rgb", "elastic", "hidden_matter", "smooth_knots", "smooth_volumes", "steady", "volume", "folding"}
+    own = {
+        "rgb",
+        "elastic",
+        "hidden_matter",
+        "smooth_knots",
+        "smooth_volumes",
+        "steady",
+        "steady_opacity",
+        "volume",
+        "folding",
+    }
     assert set(trainer.losses) == own | {loss}
     trainer.loss_every = {}  # every term in both steps
     terms = []
