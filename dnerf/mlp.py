@@ -93,12 +93,9 @@ class MLP(nn.Module):
         """Map inputs to what the last linear map sees, see `forward`."""
         if inputs.shape[-1] != self.in_features - num_lacking:
             raise ValueError(f"inputs must have {self.in_features - num_lacking} columns, got {inputs.shape[-1]}")
-        if self.hidden and not self.skips and self.activation is torch.relu_:
-            layers = [cast(nn.Linear, layer) for layer in self.hidden]
-            first, *others = (layer.weight for layer in layers)
-            first = first[:, : inputs.shape[-1]] if num_lacking else first
-            first = first if scale is None else first * scale.to(first.dtype)
-            return relu_layers(inputs, [first, *others], [layer.bias for layer in layers])
+        layers = self.relu_parameters(scale, num_lacking=num_lacking)
+        if layers is not None:
+            return relu_layers(inputs, *layers)
         if scale is not None:
             inputs = inputs * scale.to(inputs.dtype)
         if num_lacking:
@@ -107,3 +104,16 @@ class MLP(nn.Module):
         for i, layer in enumerate(self.hidden):
             x = self.activation(layer(torch.cat([x, inputs], dim=-1) if i in self.skips else x))
         return x
+
+    def relu_parameters(
+        self, scale: Tensor | None = None, *, num_lacking: int = 0
+    ) -> tuple[list[Tensor], list[Tensor]] | None:
+        """Weights and biases of all hidden layers, for inputs as `forward` takes them; None unless these are ReLU
+        layers, one after the other."""
+        if not self.hidden or self.skips or self.activation is not torch.relu_:
+            return None
+        layers = [cast(nn.Linear, layer) for layer in self.hidden]
+        first, *others = (layer.weight for layer in layers)
+        first = first[:, : self.in_features - num_lacking] if num_lacking else first
+        first = first if scale is None else first * scale.to(first.dtype)
+        return [first, *others], [layer.bias for layer in layers]

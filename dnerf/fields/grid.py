@@ -14,7 +14,7 @@ from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField
 from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.geometry import check_last_axis
-from dnerf.kernels import GridLevels, grid_encode, is_bfloat16_wanted, shade
+from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, shade
 from dnerf.mlp import MLP
 
 
@@ -132,12 +132,22 @@ class GridField(RadianceField):
         opened = (len(levels) - 1) * min(progress / self.window_end, 1.0) - levels + 1
         self.window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))
 
+    def _unit(self, positions: Tensor) -> Tensor:
+        """Places (N, 3) in the box, whose corners are 0 and 1."""
+        return (positions - self.low.to(positions.dtype)).mul_(self.scale.to(positions.dtype)).reshape(-1, 3)
+
+    @property
+    def _feature_scale(self) -> Tensor | None:
+        """Of each of the table's features; None for 1."""
+        return None if self.window_end is None else self.window.repeat_interleave(self.table.shape[1])
+
     def _inputs(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """What the head sees (..., n), and the scale (n,) of each column; without times, that without `space_time`."""
-        unit = (positions - self.low.to(positions.dtype)).mul_(self.scale.to(positions.dtype))
-        features = grid_encode(unit.reshape(-1, 3), self.table, self.levels, rounded=is_bfloat16_wanted(unit))
+        features = grid_encode(
+            self._unit(positions), self.table, self.levels, rounded=is_bfloat16_wanted(positions)
+        )  # fmt: skip
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
-        scale = None if self.window_end is None else self.window.repeat_interleave(self.table.shape[1])
+        scale = self._feature_scale
         if self.encode_times is not None:
             assert times is not None
             features, scale = _joined(features, scale, self.encode_times(times[..., None]))
@@ -146,15 +156,24 @@ class GridField(RadianceField):
         assert self.space_time is not None
         return _joined(features, scale, self.space_time(positions, times))
 
+    def _linear(self, positions: Tensor, times: Tensor | None, weight: Tensor, bias: Tensor) -> Tensor:
+        """What a linear layer makes of what the head's last one sees; without times, of that without `space_time`."""
+        is_grid_all = self.encode_times is None and (times is None or not self._sees_space_time)
+        if is_grid_all and not torch.is_grad_enabled():
+            num_lacking = self.head.in_features - self.levels.num_levels * self.table.shape[1]
+            layers = self.head.relu_parameters(self._feature_scale, num_lacking=num_lacking)
+            if layers is not None:
+                weights, biases = [*layers[0], weight], [*layers[1], bias]
+                values = grid_network(self._unit(positions), self.table, self.levels, weights, biases)
+                return values.reshape(*positions.shape[:-1], len(bias))
+        features, scale = self._inputs(positions, times)
+        seen = self.head.before_output(features, scale, num_lacking=self.head.in_features - features.shape[-1])
+        return nn.functional.linear(seen, weight, bias)
+
     def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
         """The head's outputs; without times, those without `space_time`."""
         assert self.head.output is not None
-        return self.head.output(self._before_output(positions, times))
-
-    def _before_output(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """What the head's last layer sees."""
-        features, scale = self._inputs(positions, times)
-        return self.head.before_output(features, scale, num_lacking=self.head.in_features - features.shape[-1])
+        return self._linear(positions, times, self.head.output.weight, self.head.output.bias)
 
     def _activated(self, raw: Tensor) -> Tensor:
         return activate_density(raw, self.density_activation, self.density_shift)
@@ -220,7 +239,9 @@ class GridField(RadianceField):
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
-        return self._activated(self._at(self._raw(positions, times)[..., : self.time_terms], times)[..., 0])
+        assert self.head.output is not None
+        weight, bias = (x[: self.time_terms] for x in (self.head.output.weight, self.head.output.bias))
+        return self._activated(self._at(self._linear(positions, times, weight, bias), times)[..., 0])
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3), directions (..., 3) and times (...,)."""
@@ -267,10 +288,9 @@ class GridFieldAtTime(RadianceField):
         """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
         check_one_time(times, self.time)
-        seen = self.field._before_output(positions, times)
         if self.field.density_activation != "exp":
-            return self.field._activated_values(nn.functional.linear(seen, self.weight, self.bias))
-        products = nn.functional.linear(seen, self.weight).reshape(-1, 4)
+            return self.field._activated_values(self.field._linear(positions, times, self.weight, self.bias))
+        products = self.field._linear(positions, times, self.weight, torch.zeros_like(self.bias)).reshape(-1, 4)
         density, rgb = shade(products, self.bias, self.field.density_shift)
         return FieldOutput(density.reshape(times.shape), rgb.reshape(positions.shape))
 

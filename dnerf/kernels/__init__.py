@@ -7,6 +7,7 @@ from .covered_places import covered_places
 from .few_nonzero import few_nonzero
 from .footprints import Footprints, footprints
 from .grid_encode import GridLevels, grid_encode
+from .grid_network import grid_network
 from .lattice_places import lattice_places
 from .march import MarchedSamples, MarchGrid, march
 from .march_to_size import march_to_size
@@ -34,6 +35,7 @@ __all__ = [
     "footprints",
     "get_backend",
     "grid_encode",
+    "grid_network",
     "is_bfloat16_wanted",
     "lattice_places",
     "march",

@@ -106,10 +106,7 @@ def grid_encode(positions: Tensor, table: Tensor, levels: GridLevels, *, rounded
     The compiled versions are differentiable once; second derivatives need `use_backend("reference")`. The gradient
     to the table is deterministic on the CPU; on a GPU it uses atomic adds.
     """
-    if positions.ndim != 2 or positions.shape[1] != 3:
-        raise ValueError(f"positions must have shape (N, 3), got {tuple(positions.shape)}")
-    if table.ndim != 2 or table.shape[0] != levels.num_rows:
-        raise ValueError(f"table must have shape ({levels.num_rows}, F), got {tuple(table.shape)}")
+    check_grid(positions, table, levels)
     if positions.dtype != table.dtype or positions.dtype != torch.float32:
         dtype = torch.promote_types(torch.promote_types(positions.dtype, table.dtype), torch.float32)
         positions, table = positions.to(dtype), table.to(dtype)
@@ -122,6 +119,14 @@ def grid_encode(positions: Tensor, table: Tensor, levels: GridLevels, *, rounded
     else:
         features = torch.ops.dnerf.grid_encode(positions, table, levels.cells, levels.max_rows)
     return features.bfloat16() if rounded else features
+
+
+def check_grid(positions: Tensor, table: Tensor, levels: GridLevels) -> None:
+    """Raise ValueError unless shapes are those that `grid_encode` asks for."""
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"positions must have shape (N, 3), got {tuple(positions.shape)}")
+    if table.ndim != 2 or table.shape[0] != levels.num_rows:
+        raise ValueError(f"table must have shape ({levels.num_rows}, F), got {tuple(table.shape)}")
 
 
 def grid_encode_reference(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:

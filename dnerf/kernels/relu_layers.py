@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import choose
+from .backend import choose, run_compiled
 
 # oneDNN's ReLU makes zeros of NaNs; with a slope below zero, however small, it keeps them.
 SLOPE = 1e-30
@@ -18,8 +18,10 @@ def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tens
 
     Under autocast to bfloat16, on CPUs that have it, oneDNN adds the bias and cuts off what is negative while it
     multiplies: one pass over memory instead of three, whose time is what such small networks take. Sums are then
-    rounded in another order, and what was negative is -`SLOPE` times its size instead of zero. On GPUs gradients to
-    biases are products with ones, since sums over rows take several times as long there.
+    rounded in another order, and what was negative is -`SLOPE` times its size instead of zero. CPUs that multiply
+    vectors in bfloat16, but no tiles (AMX), do without oneDNN where layers' widths are multiples of 16: a few hundred
+    rows go through all layers in registers and the nearest caches. On GPUs gradients to biases are products with ones,
+    since sums over rows take several times as long there.
 
     Args:
         inputs: (..., in_features).
@@ -36,9 +38,8 @@ def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tens
     outputs = inputs.reshape(-1, inputs.shape[-1]).bfloat16()
     if torch.is_grad_enabled():
         outputs = _Layers.apply(outputs, *weights, *biases)
-    else:  # each output takes the memory of the one before the last, which is still near
-        for weight, bias in zip(weights, biases, strict=True):
-            outputs = _layer(outputs, weight, bias)
+    else:
+        outputs = _run(outputs, weights, biases, is_kept=False)[-1]
     return outputs.reshape(*inputs.shape[:-1], len(biases[-1]))
 
 
@@ -67,6 +68,17 @@ def is_bfloat16_wanted(inputs: Tensor) -> bool:
     )
 
 
+def _run(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, is_kept: bool) -> list[Tensor]:
+    """The last layer's outputs, or those of all."""
+    if inputs.is_cpu and run_compiled("relu_layers", "serves", inputs, weights):
+        return run_compiled("relu_layers", "relu_layers", inputs, weights, biases, is_kept)
+    outputs = [inputs]
+    for weight, bias in zip(weights, biases, strict=True):
+        # Without those before, each takes the memory of the one before the last, which is still near.
+        outputs = [*(outputs if is_kept else []), _layer(outputs[-1], weight, bias)]
+    return outputs[1:] if is_kept else outputs
+
+
 def _layer(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     if inputs.is_cuda:
         return torch.relu_(torch.addmm(bias, inputs, weight.mT))
@@ -76,9 +88,8 @@ def _layer(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 class _Layers(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, *parameters: Tensor) -> Tensor:
-        outputs, num_layers = [inputs], len(parameters) // 2
-        for weight, bias in zip(parameters[:num_layers], parameters[num_layers:], strict=True):
-            outputs.append(_layer(outputs[-1], weight, bias))
+        num_layers = len(parameters) // 2
+        outputs = [inputs, *_run(inputs, parameters[:num_layers], parameters[num_layers:], is_kept=True)]
         ctx.save_for_backward(*outputs, *parameters[:num_layers])
         return outputs[-1]
 

@@ -33,12 +33,12 @@ def forward_rounded(positions: Tensor, table: Tensor, cells: list[int], max_rows
 
 
 def _launch_forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int, out: np.ndarray) -> None:
-    levels, lanes = _levels(tuple(cells), max_rows), (0,) * table.shape[1]
+    levels, lanes = levels_of(tuple(cells), max_rows), (0,) * table.shape[1]
     launch(_forward, _array(positions), _array(table), levels, out, *_workers(positions), lanes)
 
 
 def grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    levels, lanes = _levels(tuple(cells), max_rows), (0,) * table.shape[1]
+    levels, lanes = levels_of(tuple(cells), max_rows), (0,) * table.shape[1]
     out = torch.zeros_like(table, memory_format=torch.contiguous_format)
     part_bits = max(0, (num_threads() - 1) // len(levels)).bit_length()
     arrays = _array(grad), _array(positions)
@@ -47,7 +47,7 @@ def grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int],
 
 
 def grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    levels, lanes = _levels(tuple(cells), max_rows), (0,) * table.shape[1]
+    levels, lanes = levels_of(tuple(cells), max_rows), (0,) * table.shape[1]
     out = torch.empty_like(positions, memory_format=torch.contiguous_format)
     arrays = _array(grad), _array(positions), _array(table)
     launch(_grad_positions, *arrays, levels, out.numpy(), *_workers(positions), lanes)
@@ -65,7 +65,8 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _levels(cells: tuple[int, ...], max_rows: int) -> np.ndarray:
+def levels_of(cells: tuple[int, ...], max_rows: int) -> np.ndarray:
+    """`GridLevels.describe` of cells per axis of every level, flattened."""
     triples = [cells[i : i + 3] for i in range(0, len(cells), 3)]
     return np.array(GridLevels(triples, max_rows).describe(), dtype=np.int64)
 

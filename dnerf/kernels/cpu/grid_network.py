@@ -1,0 +1,98 @@
+# mypy: disable-error-code="call-arg,var-annotated"
+"""numba version of `grid_network`: a few hundred places go through encoding and layers before the next ones begin."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from torch import Tensor
+
+from .cells import PLACES, cell_tables, fractions_at, locate_all, rows_at, take_places
+from .dense import LANES, MOST_ROWS, ROWS_OF, Packed, dense, is_supported, vectors_at_once
+from .grid_encode import levels_of
+from .launch import BORROWS, FAST, kernel, launch, num_threads
+from .rows import blend_rows
+from .tasks import next_task, none_taken
+
+ROOM = PLACES + MOST_ROWS  # rows of a worker's tables: groups are full
+
+
+def serves(positions: Tensor, in_features: int, weights: Sequence[Tensor]) -> bool:
+    """Whether networks of such sizes are served on this processor."""
+    is_narrow = len(weights) > 1 and len(weights[-1]) <= LANES
+    return is_supported() and in_features % 2 == 0 and is_narrow and all(len(w) % LANES == 0 for w in weights[:-1])
+
+
+Widths = tuple[tuple[int, ...], ...]
+
+
+def network_of(
+    table: Tensor, cells: list[int], max_rows: int, weights: list[Tensor], biases: list[Tensor]
+) -> tuple[tuple[np.ndarray, ...], Widths]:
+    """What `ask_network` reads, and the lengths of vectors and groups, as tuples: constants to the compiler."""
+    vectors = vectors_at_once([len(weight) for weight in weights[:-1]])
+    packed = Packed(weights, biases, [vectors] * (len(weights) - 1) + [1])
+    levels = levels_of(tuple(cells), max_rows)
+    arrays = table.detach().contiguous().numpy(), levels, packed.layers, packed.weights, packed.biases
+    return arrays, tuple((0,) * n for n in (table.shape[1], ROWS_OF[vectors], vectors, ROWS_OF[1], 1))
+
+
+def room_of(weights: list[Tensor], workers: int) -> tuple[np.ndarray, ...]:
+    """Of workers, each its own: what `ask_network` writes between its layers, and its outputs."""
+    widest = max(len(weight) for weight in weights[:-1])
+    return (
+        np.zeros((workers, ROOM * weights[0].shape[1]), np.uint16),
+        np.zeros((workers, 2, ROOM * widest), np.uint16),
+        np.zeros((workers, ROOM * LANES), np.float32),
+    )
+
+
+def forward(
+    positions: Tensor, table: Tensor, cells: list[int], max_rows: int, weights: list[Tensor], biases: list[Tensor]
+) -> Tensor:
+    network, widths = network_of(table, cells, max_rows, weights, biases)
+    out, workers = positions.new_empty(len(positions), len(weights[-1])), num_threads()
+    room, tables = room_of(weights, workers), cell_tables(np.float32, workers)
+    launch(_network, positions.detach().contiguous().numpy(), out.numpy(), network, room, tables, none_taken(), *widths)
+    return out
+
+
+@kernel(fastmath=FAST, **BORROWS)
+def _network(
+    positions: Any, out: Any, network: Any, room: Any, tables: Any, taken: Any, lanes: Any, group: Any, vectors: Any,
+    last_group: Any, last_vectors: Any,
+) -> None:  # fmt: skip
+    for worker in prange(len(room[0])):
+        widths = lanes, group, vectors, last_group, last_vectors
+        places, fractions, rows = tables[0][worker], tables[1][worker], tables[2][worker]
+        encoded, hidden, found = room[0][worker], room[1][worker], room[2][worker]
+        first = next_task(taken) * PLACES
+        while first < len(positions):
+            count = take_places(positions, first, places)
+            ask_network(count, network, widths, (places, fractions, rows), encoded, hidden, found)
+            for i in range(count):
+                for k in range(out.shape[1]):
+                    out[first + i, k] = found[i * LANES + k]
+            first = next_task(taken) * PLACES
+
+
+@njit(fastmath=FAST, **BORROWS)
+def ask_network(count: int, network: Any, widths: Any, tables: Any, encoded: Any, hidden: Any, found: Any) -> None:
+    """The outputs, in rows of `LANES`, for so many places, which are in the first table."""
+    table, levels, layers, weights, biases = network
+    lanes, group, vectors, last_group, last_vectors = widths
+    places, fractions, rows = tables
+    num_hidden, num_features = len(layers) - 1, layers[0, 0] * 2
+    for j in range(len(levels)):
+        level = levels[j]
+        locate_all(places, count, level, rows, fractions)
+        start = j * len(lanes)
+        for i in range(count):
+            blend_rows(table, level[3], rows_at(rows, i), fractions_at(fractions, i), encoded, start, lanes)
+            start += num_features
+    dense(encoded, 0, layers[0], weights, biases, hidden[0], 0, count, group, vectors)
+    for i in range(1, num_hidden):
+        dense(hidden[(i - 1) % 2], 0, layers[i], weights, biases, hidden[i % 2], 0, count, group, vectors)
+    last = hidden[(num_hidden - 1) % 2]
+    dense(last, 0, layers[num_hidden], weights, biases, found, 0, count, last_group, last_vectors)

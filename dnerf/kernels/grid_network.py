@@ -1,0 +1,75 @@
+"""A small network on features of a grid, without gradients: what pictures and filters ask of a field."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .backend import choose, run_compiled
+from .grid_encode import GridLevels, check_grid, grid_encode
+from .op import op
+from .relu_layers import is_bfloat16_wanted, relu_layers
+
+
+@torch.no_grad()
+def grid_network(
+    positions: Tensor, table: Tensor, levels: GridLevels, weights: Sequence[Tensor], biases: Sequence[Tensor]
+) -> Tensor:
+    """`relu_layers` of `grid_encode`, and a last linear layer: W x + b. Not differentiable.
+
+    Under autocast to bfloat16, on CPUs that multiply vectors in it but no tiles (AMX), features and what is between
+    layers never leave the nearest caches: at most 16 outputs, hidden layers in multiples of 16, an even number of
+    features. The last layer's products are then not rounded.
+
+    Args:
+        positions: (N, 3), in [0, 1].
+        table: (T, F), T = `levels.num_rows`.
+        levels: the grid's resolutions and table layout.
+        weights: of each layer, at least two, (out_features, in_features); the first one's inputs are the L F features.
+        biases: likewise, (out_features,).
+
+    Returns:
+        (N, out_features of the last layer).
+
+    Raises:
+        ValueError: a shape that does not fit, or fewer than two layers.
+    """
+    if len(weights) < 2 or len(weights) != len(biases):
+        raise ValueError(f"weights and biases must be of at least two layers, got {len(weights)} and {len(biases)}")
+    in_features = levels.num_levels * table.shape[-1]
+    if weights[0].shape[-1] != in_features:
+        raise ValueError(f"the first weights must have {in_features} columns, got {tuple(weights[0].shape)}")
+    if all(x.dtype == torch.float32 for x in (positions, table)) and _is_fused(positions, in_features, weights):
+        check_grid(positions, table, levels)
+        rounded = [[x.bfloat16() for x in parameters] for parameters in (weights, biases)]
+        return torch.ops.dnerf.grid_network(positions, table, levels.cells, levels.max_rows, *rounded)
+    return grid_network_reference(positions, table, levels, weights, biases)
+
+
+def grid_network_reference(
+    positions: Tensor, table: Tensor, levels: GridLevels, weights: Sequence[Tensor], biases: Sequence[Tensor]
+) -> Tensor:
+    """The definition of `grid_network`: one after the other."""
+    features = grid_encode(positions, table, levels, rounded=is_bfloat16_wanted(positions))
+    hidden = relu_layers(features, weights[:-1], biases[:-1])
+    return torch.nn.functional.linear(hidden, weights[-1], biases[-1])
+
+
+def _is_fused(positions: Tensor, in_features: int, weights: Sequence[Tensor]) -> bool:
+    if not is_bfloat16_wanted(positions) or positions.is_cuda or choose(positions) != "numba":
+        return False
+    return run_compiled("grid_network", "serves", positions, in_features, weights)
+
+
+@op("dnerf::grid_network")
+def _grid_network(
+    positions: Tensor, table: Tensor, cells: list[int], max_rows: int, weights: list[Tensor], biases: list[Tensor]
+) -> Tensor:
+    return run_compiled("grid_network", "forward", positions, table, cells, max_rows, weights, biases)
+
+
+@_grid_network.register_fake
+def _(
+    positions: Tensor, table: Tensor, cells: list[int], max_rows: int, weights: list[Tensor], biases: list[Tensor]
+) -> Tensor:
+    return positions.new_empty((positions.shape[0], weights[-1].shape[0]))
