@@ -20,7 +20,7 @@ from dnerf.quadrature import check_rule
 from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 from dnerf.samplers.visibility import PackedRounds, Source, walk_front_to_back
-from dnerf.tracing import FrameTracer
+from dnerf.tracing import FrameTracer, NetworkTracer, Tracer
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class Renderer(nn.Module):
         )
         return Rendering(**{**vars(rendering), "proposals": proposals})
 
-    def _without_gradients(self, rays: Rays, field: RadianceField, tracer: FrameTracer | None = None) -> Rendering:
+    def _without_gradients(self, rays: Rays, field: RadianceField, tracer: Tracer | None = None) -> Rendering:
         """What `forward` shows of a field, without per-sample data: rays end where they are opaque.
 
         Args:
@@ -258,11 +258,14 @@ class Renderer(nn.Module):
         numbers, rays = (None, camera.rays(time)) if seen is None else seen
         grid = self.sampler.grid_at(time, camera.pose.dtype)
         field = self.field.at_time(time, None if grid is None else grid.extent())
-        tracer = FrameTracer.of(field, grid, time, self.stop_transmittance) if self._ends_early else None
+        tracer: Tracer | None = None
+        if self._ends_early:
+            tracer = FrameTracer.of(field, grid, time, self.stop_transmittance)
         lattice = getattr(field, "deformation", None)
         if tracer is None and grid is not None and isinstance(lattice, FrozenDeformation):
             with self.autocast(self.device):
-                lattice.fill_around(grid, len(rays))
+                if lattice.fill_around(grid, len(rays)) and self._ends_early:
+                    tracer = NetworkTracer.of(field, grid, self.stop_transmittance)
         parts = list(self._in_chunks(rays, field, chunk, tracer))
         columns = [_columns(part) for part in parts]
         if numbers is None:
@@ -306,7 +309,7 @@ class Renderer(nn.Module):
         return picture
 
     def _in_chunks(
-        self, rays: Rays, field: RadianceField, chunk: int, tracer: FrameTracer | None
+        self, rays: Rays, field: RadianceField, chunk: int, tracer: Tracer | None
     ) -> Iterator[Rendering]:
         """Render so many rays at a time; half as many from where a GPU's memory does not suffice."""
         start = 0

@@ -1,5 +1,8 @@
 """Rays of one frame through what is kept of a field, instead of asking it sample by sample."""
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -7,10 +10,15 @@ from dnerf.deformations.carried_bodies import CarriedBodies
 from dnerf.deformations.frame_lattice import FrozenDeformation
 from dnerf.fields import DeformedField, RadianceField
 from dnerf.fields.baked import BakedField
-from dnerf.kernels import FrameTables, MarchGrid, few_nonzero, trace
+from dnerf.fields.grid import GridFieldAtTime
+from dnerf.kernels import FrameTables, MarchGrid, NetworkTables, few_nonzero, trace, trace_network
 from dnerf.kernels.backend import choose
 from dnerf.kernels.trace import DONE, ELSEWHERE, NUM_STATES
+from dnerf.kernels.trace_network import serves
 from dnerf.rays import Rays
+
+Tracer = Callable[[Rays], tuple[Tensor, Tensor]]
+"""What rays of one time show without a background, (R, 5), and of which rays (R,) that is true."""
 
 PIONEERS = 5  # one ray of so many is sent ahead once, to find what most of its neighbours will want
 
@@ -155,3 +163,83 @@ class FrameTracer:
             brick_low=self.canonical.low,
             waves=self.waves,
         )
+
+
+class NetworkTracer:
+    """Pictures of one time of a grid field whose displacements are on a lattice, of a frame alone.
+
+    What `Renderer` shows of it, with one kernel (`trace_network`) instead of rounds of several; the two differ by
+    rounding, and by the light of the intervals that only one of them takes for unseen.
+
+    Args:
+        deformation: on its lattice, which is filled around all occupied cells (`FrozenDeformation.fill_around`).
+        tables: see `GridFieldAtTime.tables`.
+        grid: occupied cells at that time.
+        stop_transmittance: see `FrameTracer`.
+        bodies: likewise.
+    """
+
+    def __init__(
+        self,
+        deformation: FrozenDeformation,
+        tables: dict[str, Any],
+        grid: MarchGrid,
+        *,
+        stop_transmittance: float,
+        bodies: CarriedBodies | None = None,
+    ) -> None:
+        self.deformation = deformation
+        self.grid = grid
+        self.stop_transmittance = stop_transmittance
+        self.bodies = bodies
+        self.tables = NetworkTables(
+            occupancy=grid.occupancy,
+            skips=grid.skips,
+            aabb=grid.aabb,
+            displacements=deformation.displacements,
+            is_known=deformation.is_known,
+            low=deformation.low,
+            sides=deformation.sides,
+            **tables,
+        )
+
+    @classmethod
+    def of(cls, field: RadianceField, grid: MarchGrid, stop_transmittance: float) -> "NetworkTracer | None":
+        """A tracer of a frame's field, see `RadianceField.at_time`, under autocast to the precision in which it is
+        asked; None where there is no lattice, or no kernel for its network.
+
+        Args:
+            field: at that time; its lattice is filled.
+            grid: occupied cells at that time.
+            stop_transmittance: see `FrameTracer`.
+        """
+        if not isinstance(field, DeformedField) or not isinstance(field.deformation, FrozenDeformation):
+            return None
+        tables = field.canonical.tables() if isinstance(field.canonical, GridFieldAtTime) else None
+        if tables is None or any(x.dtype != torch.float32 for x in (grid.aabb, tables["table"], tables["field_low"])):
+            return None
+        if not serves(grid.aabb, tables["weights"][0].shape[1], tables["weights"]):
+            return None
+        return cls(field.deformation, tables, grid, stop_transmittance=stop_transmittance, bodies=field.bodies)
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """What R rays show, without a background.
+
+        Args:
+            rays: all of the frame's time.
+
+        Returns:
+            rgb, depth times opacity, and opacity, (R, 5); and of which rays (R,) that is true. The others left the
+            lattice, came to vertices that are not known, or meet carried bodies; theirs is 0.
+        """
+        is_left = torch.zeros(len(rays), dtype=torch.bool, device=rays.origins.device)
+        if self.bodies is not None and self.bodies.num_bodies:
+            is_left = self.bodies.are_met(rays.origins, rays.directions, self.deformation.time)
+        states, is_done = trace_network(
+            rays.origins, rays.directions, rays.near, rays.far, is_left, self.tables,
+            step=self.grid.step, splits=self.grid.splits, split_weight=self.grid.split_weight,
+            min_weight=self.stop_transmittance, stop_transmittance=self.stop_transmittance,
+        )  # fmt: skip
+        sums = torch.cat([states[:, 1:], 1 - states[:, :1]], dim=-1)
+        return torch.where(is_done[:, None], sums, 0).to(rays.origins.dtype), is_done

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -159,16 +160,19 @@ class GridField(RadianceField):
     def _linear(self, positions: Tensor, times: Tensor | None, weight: Tensor, bias: Tensor) -> Tensor:
         """What a linear layer makes of what the head's last one sees; without times, of that without `space_time`."""
         is_grid_all = self.encode_times is None and (times is None or not self._sees_space_time)
-        if is_grid_all and not torch.is_grad_enabled():
-            num_lacking = self.head.in_features - self.levels.num_levels * self.table.shape[1]
-            layers = self.head.relu_parameters(self._feature_scale, num_lacking=num_lacking)
-            if layers is not None:
-                weights, biases = [*layers[0], weight], [*layers[1], bias]
-                values = grid_network(self._unit(positions), self.table, self.levels, weights, biases)
-                return values.reshape(*positions.shape[:-1], len(bias))
+        layers = self._grid_layers() if is_grid_all and not torch.is_grad_enabled() else None
+        if layers is not None:
+            weights, biases = [*layers[0], weight], [*layers[1], bias]
+            values = grid_network(self._unit(positions), self.table, self.levels, weights, biases)
+            return values.reshape(*positions.shape[:-1], len(bias))
         features, scale = self._inputs(positions, times)
         seen = self.head.before_output(features, scale, num_lacking=self.head.in_features - features.shape[-1])
         return nn.functional.linear(seen, weight, bias)
+
+    def _grid_layers(self) -> tuple[list[Tensor], list[Tensor]] | None:
+        """Weights and biases of the head's hidden layers that see the table's features, see `MLP.relu_parameters`."""
+        num_lacking = self.head.in_features - self.levels.num_levels * self.table.shape[1]
+        return self.head.relu_parameters(self._feature_scale, num_lacking=num_lacking)
 
     def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
         """The head's outputs; without times, those without `space_time`."""
@@ -278,6 +282,17 @@ class GridFieldAtTime(RadianceField):
         self.register_buffer("bias", last.bias.detach().unflatten(0, (4, -1)) @ waves)
         self.weight: Tensor
         self.bias: Tensor
+
+    def tables(self) -> dict[str, Any] | None:
+        """What `dnerf.kernels.NetworkTables` have to know of it; None where it is not all that it shows."""
+        field, layers = self.field, self.field._grid_layers()
+        if layers is None or field.density_activation != "exp" or field._sees_space_time:
+            return None
+        return {
+            "field_low": field.low, "field_scale": field.scale, "table": field.table, "levels": field.levels,
+            "weights": [*layers[0], self.weight], "biases": [*layers[1], torch.zeros_like(self.bias)],
+            "shifts": self.bias + self.bias.new_tensor([field.density_shift, 0, 0, 0]),
+        }  # fmt: skip
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""

@@ -19,6 +19,7 @@ from .shade import shade
 from .skip_distances import skip_distances
 from .thin_out import thin_out
 from .trace import FrameTables, trace
+from .trace_network import NetworkTables, trace_network
 
 __all__ = [
     "BACKENDS",
@@ -27,6 +28,7 @@ __all__ = [
     "GridLevels",
     "MarchGrid",
     "MarchedSamples",
+    "NetworkTables",
     "SeenParts",
     "add_seen",
     "brick_lookup",
@@ -49,5 +51,6 @@ __all__ = [
     "skip_distances",
     "thin_out",
     "trace",
+    "trace_network",
     "use_backend",
 ]

@@ -1,0 +1,293 @@
+# mypy: disable-error-code="call-arg,var-annotated"
+"""numba version of `trace_network`: many rays of a thread's at once, each at its next interval."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from ..shade import MOST_LOG_DENSITY
+from ..trace_network import NUM_STATES
+from .cells import PLACES, cell_tables, clamped, fractions_at, locate_all, rows_at
+from .course import (
+    LINE,
+    RAYS_AT_ONCE,
+    TESTED_AT_ONCE,
+    block_bounds,
+    cells_of_workers,
+    course_of,
+    interval,
+    next_kept,
+    ray_ranges,
+)
+from .dense import LANES
+from .exponential import exp, expm1, sigmoid
+from .grid_network import ask_network, network_of, room_of
+from .launch import BORROWS, kernel, launch, num_threads
+from .rows import blend_rows, trailing_zeros
+from .tasks import next_task, none_taken
+
+NOWHERE = np.float32(np.nan)  # outside the lattice
+MOST = np.float32(MOST_LOG_DENSITY)
+LEFT_OUT, WHOLE, CUT, ELSEWHERE = 0, 1, 2, 3
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+
+
+def trace_network(
+    is_left: Tensor, rays: list[Tensor], tables: list[Tensor], cells: list[int], max_rows: int, weights: list[Tensor],
+    biases: list[Tensor], splits: int, scalars: list[float],
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    step, min_weight, split_weight, stop_transmittance = (np.float32(x) for x in scalars)
+    o, d, t0, t1 = (x.contiguous().numpy() for x in rays)
+    occupancy, skips, box, displacements, is_known, low, sides, field_low, scale, table, shifts = (
+        x.detach().contiguous() for x in tables
+    )
+    states = rays[0].new_zeros(len(o), NUM_STATES)
+    states[:, 0] = 1
+    is_done = ~is_left
+    shape, aabb, reach = tuple(occupancy.shape), box.numpy(), skips.numpy()
+    ranges, counts = np.empty((len(o), 3), o.dtype), np.empty(len(o), np.int64)
+    launch(ray_ranges, o, d, t0, t1, np.zeros_like(t0), aabb, step, ranges, counts)
+    bounds = np.empty((1, 3, 2), np.int64)
+    launch(block_bounds, reach[None], bounds)
+    network, widths = network_of(table, cells, max_rows, weights, biases)
+    workers, num_words = num_threads(), (int(counts.max(initial=0)) + TESTED_AT_ONCE) // 64 + 1
+    level = is_known.shape[2] - 1, is_known.shape[1] - 1, is_known.shape[0] - 1, 0, -1
+    launch(
+        _trace,
+        (o, d, t0, ranges, counts),
+        (occupancy.view(-1).numpy(), shape, reach, bounds[0], aabb, step),
+        (displacements.numpy(), level, low.numpy(), sides.numpy()),
+        (field_low.numpy(), scale.numpy(), shifts.numpy()),
+        network,
+        (splits, min_weight, split_weight, stop_transmittance),
+        states.numpy(),
+        is_done.numpy(),
+        _scratch(workers, splits, num_words, displacements.shape[1]),
+        room_of(weights, workers),
+        cell_tables(np.float32, workers),
+        none_taken(),
+        (0,) * displacements.shape[1],
+        *widths,
+    )  # fmt: skip
+    return states, is_done
+
+
+def _scratch(workers: int, splits: int, num_words: int, num_moved: int) -> tuple[np.ndarray, ...]:
+    """Each worker's: rays, what becomes of their intervals, and owners of parts; bits of kept intervals; where those
+    begin and how long they are; values of the intervals; of their parts; distances of places; a row of the lattice;
+    cells."""
+    return (
+        np.empty((workers, 2, PLACES), np.int64),
+        np.empty((workers, splits * PLACES), np.int64),
+        np.empty((workers, PLACES, num_words), np.uint64),
+        np.empty((workers, 2, PLACES), np.float32),
+        np.empty((workers, 5, PLACES), np.float32),
+        np.empty((workers, splits, 5, PLACES), np.float32),
+        np.empty((workers, splits * PLACES), np.float32),
+        np.empty((workers, num_moved + LINE), np.float32),
+        cells_of_workers(workers),
+    )
+
+
+# No fast-math: intervals and cells must round like those of the definition.
+@kernel(**BORROWS)
+def _trace(
+    rays: Any, grid: Any, lattice: Any, field: Any, network: Any, options: Any, states: Any, is_done: Any, scratch: Any,
+    room: Any, tables: Any, taken: Any, columns: Any, lanes: Any, group: Any, vectors: Any, last_group: Any,
+    last_vectors: Any,
+) -> None:  # fmt: skip
+    splits, min_weight, split_weight, stop_transmittance = options
+    origins, directions, near, ranges, counts = rays
+    occupancy, shape, skips, bounds, aabb, step = grid
+    displacements, level, low, sides = lattice
+    num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
+    for worker in prange(len(room[0])):
+        frozen, widths = (displacements, level, low, sides), (lanes, group, vectors, last_group, last_vectors)
+        work = tables[0][worker], tables[1][worker], tables[2][worker]
+        own = room[0][worker], room[1][worker], room[2][worker]
+        numbers, kinds, owners, kept = (
+            scratch[0][worker, 0],
+            scratch[0][worker, 1],
+            scratch[1][worker],
+            scratch[2][worker],
+        )
+        firsts, lengths, values, part_values = (
+            scratch[3][worker, 0],
+            scratch[3][worker, 1],
+            scratch[4][worker],
+            scratch[5][worker],
+        )
+        distances, moved, cells = scratch[6][worker], scratch[7][worker], scratch[8][worker]
+        active, r, last = 0, 0, 0
+        has_more = True
+        while True:
+            while has_more and active < PLACES:
+                if r == last:
+                    task = next_task(taken)
+                    has_more = task < num_groups
+                    r, last = task * RAYS_AT_ONCE, min((task + 1) * RAYS_AT_ONCE, len(near))
+                    continue
+                if is_done[r]:
+                    j, count, course = course_of(
+                        origins[r], directions[r], near[r], ZERO, step, ranges[r], counts[r], shape, bounds, aabb
+                    )  # fmt: skip
+                    if _mark(j, count, course, occupancy, skips, cells, kept[active]):
+                        numbers[active] = r
+                        active += 1
+                r += 1
+            if active == 0:
+                break
+            for s in range(active):
+                n = numbers[s]
+                j = _take(kept[s])
+                start, end = interval(near[n], ZERO, step, ranges[n, 0], ranges[n, 1], ranges[n, 2] + np.float32(j))
+                firsts[s], lengths[s], distances[s], owners[s] = start, end - start, HALF * (start + end), s
+            _ask(
+                active, rays, numbers, owners, 0, distances, frozen, field, network, widths, columns, moved, work, own,
+                values,
+            )  # fmt: skip
+            num_parts = 0
+            for s in range(active):
+                kinds[s] = LEFT_OUT
+                if math.isnan(values[4, s]):
+                    kinds[s] = ELSEWHERE
+                    continue
+                weight = states[numbers[s], 0] * -expm1(-values[0, s] * lengths[s])
+                if splits == 1 or min_weight < weight <= split_weight:
+                    kinds[s] = WHOLE
+                elif not weight <= min_weight:  # NaN is seen
+                    kinds[s] = CUT
+                    for k in range(splits):
+                        if 2 * k + 1 != splits:  # else its middle is the interval's
+                            owners[num_parts] = s
+                            distances[num_parts] = firsts[s] + (np.float32(k) + HALF) * lengths[s] / np.float32(splits)
+                            num_parts += 1
+            for first in range(0, num_parts, PLACES):
+                count = min(PLACES, num_parts - first)
+                _ask(
+                    count, rays, numbers, owners, first, distances, frozen, field, network, widths, columns, moved, work,
+                    own, part_values[first // PLACES],
+                )  # fmt: skip
+            part = 0
+            for s in range(active):
+                state = states[numbers[s]]
+                if kinds[s] == WHOLE:
+                    _add(state, values, s, firsts[s] + HALF * lengths[s], lengths[s])
+                elif kinds[s] == CUT:
+                    length, is_known = lengths[s] / np.float32(splits), True
+                    for k in range(splits):
+                        middle = firsts[s] + (np.float32(k) + HALF) * length
+                        if 2 * k + 1 == splits:
+                            _add(state, values, s, middle, length)
+                        else:
+                            found, i = part_values[part // PLACES], part % PLACES
+                            is_known = is_known and not math.isnan(found[4, i])
+                            _add(state, found, i, middle, length)
+                            part += 1
+                    if not is_known:
+                        kinds[s] = ELSEWHERE
+            s = 0
+            while s < active:
+                n = numbers[s]
+                if kinds[s] == ELSEWHERE:
+                    is_done[n] = False
+                if kinds[s] != ELSEWHERE and states[n, 0] > stop_transmittance and _any(kept[s]):
+                    s += 1
+                    continue
+                active -= 1
+                numbers[s], kinds[s] = numbers[active], kinds[active]
+                for k in range(kept.shape[1]):
+                    kept[s, k] = kept[active, k]
+
+
+@njit(**BORROWS)
+def _mark(j: int, count: int, course: Any, occupancy: Any, skips: Any, cells: Any, kept: Any) -> bool:
+    """Set the bits of a ray's kept intervals; whether there are any."""
+    for k in range(len(kept)):
+        kept[k] = 0
+    any_ = False
+    while True:
+        j, bits = next_kept(j, count, course, occupancy, skips, cells)
+        if bits == 0:
+            return any_
+        any_ = True
+        kept[j >> 6] |= bits << np.uint64(j & 63)
+        if j & 63 > 64 - TESTED_AT_ONCE:
+            kept[(j >> 6) + 1] |= bits >> np.uint64(64 - (j & 63))
+        j += TESTED_AT_ONCE
+
+
+@njit(**BORROWS)
+def _take(kept: Any) -> int:
+    """The number of the first interval, whose bit is cleared."""
+    word = 0
+    while kept[word] == 0:
+        word += 1
+    number = (word << 6) + int(trailing_zeros(kept[word]))
+    kept[word] &= kept[word] - np.uint64(1)
+    return number
+
+
+@njit(**BORROWS)
+def _any(kept: Any) -> bool:
+    for k in range(len(kept)):
+        if kept[k]:
+            return True
+    return False
+
+
+@njit(**BORROWS)
+def _ask(
+    count: int, rays: Any, numbers: Any, owners: Any, first: int, distances: Any, lattice: Any, field: Any, network: Any,
+    widths: Any, columns: Any, moved: Any, work: Any, own: Any, values: Any,
+) -> None:  # fmt: skip
+    """Density and colours at so many places, and what is NaN where it is not known: (5, n)."""
+    origins, directions = rays[:2]
+    displacements, level, low, sides = lattice
+    field_low, scale, shifts = field
+    places, fractions, rows = work
+    encoded, hidden, found = own
+    for i in range(count):
+        r, t = numbers[owners[first + i]], distances[first + i]
+        for axis in range(3):
+            places[axis, i] = values[1 + axis, i] = origins[r, axis] + t * directions[r, axis]
+    for axis in range(3):
+        line = places[axis]
+        for i in range(count):
+            share = (line[i] - low[axis]) / sides[axis]
+            line[i] = share if ZERO <= share <= ONE else NOWHERE
+    locate_all(places, count, level, rows, fractions)
+    for i in range(count):
+        blend_rows(displacements, 0, rows_at(rows, i), fractions_at(fractions, i), moved, 0, columns)
+        total = ZERO
+        for axis in range(3):
+            place = (values[1 + axis, i] + moved[axis] - field_low[axis]) * scale[axis]
+            places[axis, i] = clamped(place)
+            total += place
+        values[4, i] = total - total  # NaN of what is no number
+    ask_network(count, network, widths, (places, fractions, rows), encoded, hidden, found)
+    for i in range(count):
+        for k in range(4):
+            values[k, i] = found[i * LANES + k] + shifts[k]
+    densities = values[0, :count]
+    for i in range(len(densities)):
+        densities[i] = exp(MOST if densities[i] > MOST else densities[i])
+    for k in range(1, 4):
+        colors = values[k, :count]
+        for i in range(len(colors)):
+            colors[i] = sigmoid(colors[i])
+
+
+@njit(forceinline=True, **BORROWS)
+def _add(state: Any, values: Any, i: int, distance: Any, length: Any) -> None:
+    """Composite one interval behind a ray's state."""
+    opacity = -expm1(-values[0, i] * length)
+    weight = state[0] * opacity
+    for k in range(1, 4):
+        state[k] += weight * values[k, i]
+    state[4] += weight * distance
+    state[0] *= ONE - opacity
