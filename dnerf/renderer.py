@@ -201,11 +201,14 @@ class Renderer(nn.Module):
     def for_sequence(self, num_frames: int) -> "Renderer":
         """A renderer of the same finished model for so many frames; this one, unless sharing work between them pays.
 
-        It does for long sequences of scenes that are mostly empty. What the frames share is computed as they come and
+        It does for long sequences of scenes that are mostly empty, where no kernel asks the field itself as quickly
+        (`NetworkTracer`). What the frames share is computed as they come and
         kept (`RadianceField.finished`), so it knows nothing of later changes of the field. Sampler and background are
         this renderer's own.
         """
         pays = num_frames >= FRAMES_THAT_SHARE and self.sampler.share <= MOST_TO_SHARE and not self._replays
+        with self.autocast(self.device):
+            pays = pays and not (self._ends_early and NetworkTracer.serves(self.field))
         field = self.field.finished() if pays else self.field
         if field is self.field:
             return self
@@ -308,9 +311,7 @@ class Renderer(nn.Module):
         picture[:, :3] = color
         return picture
 
-    def _in_chunks(
-        self, rays: Rays, field: RadianceField, chunk: int, tracer: Tracer | None
-    ) -> Iterator[Rendering]:
+    def _in_chunks(self, rays: Rays, field: RadianceField, chunk: int, tracer: Tracer | None) -> Iterator[Rendering]:
         """Render so many rays at a time; half as many from where a GPU's memory does not suffice."""
         start = 0
         while start < len(rays):

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dnerf.deformations.carried_bodies import CarriedBodies
 from dnerf.deformations.frame_lattice import FrozenDeformation
+from dnerf.deformations.identity import IdentityDeformation
 from dnerf.fields import DeformedField, RadianceField
 from dnerf.fields.baked import BakedField
 from dnerf.fields.grid import GridFieldAtTime
@@ -215,12 +216,19 @@ class NetworkTracer:
         """
         if not isinstance(field, DeformedField) or not isinstance(field.deformation, FrozenDeformation):
             return None
-        tables = field.canonical.tables() if isinstance(field.canonical, GridFieldAtTime) else None
-        if tables is None or any(x.dtype != torch.float32 for x in (grid.aabb, tables["table"], tables["field_low"])):
-            return None
-        if not serves(grid.aabb, tables["weights"][0].shape[1], tables["weights"]):
+        tables = _tables(field.canonical)
+        if tables is None or grid.aabb.dtype != torch.float32:
             return None
         return cls(field.deformation, tables, grid, stop_transmittance=stop_transmittance, bodies=field.bodies)
+
+    @staticmethod
+    def serves(field: RadianceField) -> bool:
+        """Whether there is one for frames of a field, under autocast as for `of`, wherever its matter is no haze."""
+        if not isinstance(field, DeformedField) or field.frame_lattice is None:
+            return False
+        return (
+            not isinstance(field.deformation, IdentityDeformation) and _tables(field.canonical.at_time(0)) is not None
+        )
 
     @torch.no_grad()
     def __call__(self, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -243,3 +251,11 @@ class NetworkTracer:
         )  # fmt: skip
         sums = torch.cat([states[:, 1:], 1 - states[:, :1]], dim=-1)
         return torch.where(is_done[:, None], sums, 0).to(rays.origins.dtype), is_done
+
+
+def _tables(canonical: RadianceField) -> dict[str, Any] | None:
+    """What `NetworkTables` have to know of a canonical field at one time; None if no kernel asks it."""
+    tables = canonical.tables() if isinstance(canonical, GridFieldAtTime) else None
+    if tables is None or any(tables[name].dtype != torch.float32 for name in ("table", "field_low", "shifts")):
+        return None
+    return tables if serves(tables["table"], tables["weights"][0].shape[1], tables["weights"]) else None

@@ -12,11 +12,13 @@ from dnerf.deformations import CarriedBodies, DisplacementDeformation, FrameLatt
 from dnerf.deformations.carried_bodies import NOWHERE
 from dnerf.deformations.frame_lattice import FrozenDeformation
 from dnerf.fields import Baking, DeformedField, GridField, RadianceField, SpaceTimeVolumes
+from dnerf.fields.baked import BakedField
 from dnerf.kernels import use_backend
+from dnerf.kernels.cpu.dense import has_vectors
 from dnerf.rays import Rays
 from dnerf.renderer import Renderer
 from dnerf.samplers import OccupancySampler
-from dnerf.tracing import FrameTracer
+from dnerf.tracing import FrameTracer, NetworkTracer
 
 BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 CAMERA = Camera(Intrinsics(32, 24, 30.0, 30.0), look_at([0.3, -3.2, 0.8], [0.0, 0.0, 0.0]))
@@ -33,6 +35,7 @@ def model(
     brick_cells: int = 32,
     volumes: SpaceTimeVolumes | None = None,
     bodies: CarriedBodies | None = None,
+    precision: str = "float32",
 ) -> Renderer:
     """A random body in the middle of the box, moved a little, as frames of a sequence see it."""
     torch.manual_seed(0)
@@ -58,7 +61,7 @@ def model(
     mask[5:11, 5:11, 4:12] = True
     sampler.occupy(mask)
     assert sampler.share < 0.1
-    return Renderer(field, sampler, stop_transmittance=stop).eval().for_sequence(60)
+    return Renderer(field, sampler, stop_transmittance=stop, precision=precision).eval().for_sequence(60)
 
 
 def picture(renderer: Renderer, time: float = 0.3) -> Tensor:
@@ -232,3 +235,95 @@ def test_what_space_time_volumes_add_is_kept_on_the_lattice() -> None:
             errors.append(float((picture(renderer)[..., :3] - exact).square().mean().sqrt()))
     assert float((without - exact).square().mean().sqrt()) > 10 * errors[1]
     assert errors[0] > 2.5 * errors[1] > 6 * errors[2]
+
+
+vectors = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
+
+
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
+    """Networks are asked by kernels, also on CPUs that multiply tiles; of which rays (R,) they were to their end."""
+    monkeypatch.setattr("dnerf.kernels.cpu.grid_network.is_supported", lambda: True)
+    monkeypatch.setattr("dnerf.deformations.frame_lattice.VERTICES_PER_RAY", 100)  # these pictures are small
+    done: list[Tensor] = []
+    call = NetworkTracer.__call__
+
+    def traced(self: NetworkTracer, rays: Rays) -> tuple[Tensor, Tensor]:
+        sums, is_done = call(self, rays)
+        done.append(is_done)
+        return sums, is_done
+
+    monkeypatch.setattr(NetworkTracer, "__call__", traced)
+    return done
+
+
+def chain(renderer: Renderer, time: float = 0.3) -> Tensor:
+    """The picture by rounds of samples."""
+    with patch.object(NetworkTracer, "of", return_value=None):
+        return picture(renderer, time)
+
+
+@vectors
+@pytest.mark.parametrize("time_terms", [1, 3])
+@pytest.mark.parametrize("splits", [1, 3])
+def test_frames_alone_by_one_kernel_are_those_by_rounds(time_terms: int, splits: int, network: list[Tensor]) -> None:
+    renderer = model(time_terms=time_terms, splits=splits, stop=1e-4, precision="bfloat16")
+    expected = chain(renderer)
+    assert not network
+    shown = picture(renderer)
+    assert torch.cat(network).all()
+    assert (expected[..., 3] > 0.9).any()
+    assert expected[..., :3].std() > 0.05
+    # Rounding decides what is seen of what is hardly seen; depths are of pixels with some opacity.
+    torch.testing.assert_close(shown[..., :4], expected[..., :4], rtol=0, atol=3e-3)
+    is_there = expected[..., 3] > 0.1
+    torch.testing.assert_close(shown[is_there], expected[is_there], rtol=0, atol=2e-2)
+    assert torch.equal(picture(renderer), shown)
+    parts = renderer.render_image(CAMERA, 0.3, chunk=100)
+    assert torch.equal(parts.rgb, shown[..., :3])
+
+
+@vectors
+def test_sequences_keep_no_bricks_where_a_kernel_asks_the_field(network: list[Tensor]) -> None:
+    renderer = model(precision="bfloat16")
+    assert renderer.for_sequence(60) is renderer
+    assert not isinstance(renderer.field.canonical, BakedField)  # type: ignore[union-attr]
+    picture(renderer)
+    assert network
+    assert isinstance(model().field.canonical, BakedField)  # type: ignore[union-attr]
+    with use_backend("reference"):
+        assert isinstance(model(precision="bfloat16").field.canonical, BakedField)  # type: ignore[union-attr]
+
+
+@vectors
+def test_rays_that_a_kernel_cannot_follow_are_shown_all_the_same(network: list[Tensor]) -> None:
+    small = model(box=[[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]], cells=12, precision="bfloat16")
+    torch.testing.assert_close(picture(small)[..., :4], chain(small)[..., :4], rtol=0, atol=3e-3)
+    assert not torch.cat(network).all()
+    network.clear()
+    bodies = CarriedBodies(2, 5)
+    bodies.add(torch.tensor([[0.0, 0.0, 0.1]]).repeat(5, 1), torch.tensor([0.8, 0.8, 0.8]), 0.12)
+    carried = model(bodies=bodies, precision="bfloat16")
+    torch.testing.assert_close(picture(carried)[..., :4], chain(carried)[..., :4], rtol=0, atol=3e-3)
+    assert 0.5 < float(torch.cat(network).float().mean()) < 1
+
+
+@vectors
+def test_kernels_are_used_only_where_they_show_the_same(network: list[Tensor]) -> None:
+    torch.manual_seed(0)
+    volumes = SpaceTimeVolumes(BOX, (3,), (2,), num_features=2)
+    for renderer in (model(), model(volumes=volumes, precision="bfloat16")):
+        picture(renderer)
+    assert not network
+
+
+@vectors
+@pytest.mark.parametrize("splits", [1, 3])
+def test_nan_is_shown_by_a_kernel_too(splits: int, network: list[Tensor]) -> None:
+    for part in ("deformation", "canonical"):
+        renderer = model(splits=splits, precision="bfloat16")
+        with torch.no_grad():
+            for parameter in getattr(renderer.field, part).parameters():
+                parameter.fill_(torch.nan)
+        assert picture(renderer).isnan().any()
+    assert network

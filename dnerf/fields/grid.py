@@ -205,8 +205,8 @@ class GridField(RadianceField):
         return self._waves(torch.tensor(time, device=self.orders.device)), self.density_shift
 
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
-        """The same with its series summed up, if it has any and sees no directions."""
-        return self if self.time_terms == 1 or not self.num_contents else GridFieldAtTime(self, time)
+        """The same with its series summed up, if it sees no directions."""
+        return GridFieldAtTime(self, time) if self.num_contents else self
 
     def contents(self, positions: Tensor) -> Tensor:
         """The head's outputs (..., 4 K) at canonical positions (..., 3), `space_time` unseen."""
@@ -243,9 +243,7 @@ class GridField(RadianceField):
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
-        assert self.head.output is not None
-        weight, bias = (x[: self.time_terms] for x in (self.head.output.weight, self.head.output.bias))
-        return self._activated(self._at(self._linear(positions, times, weight, bias), times)[..., 0])
+        return self._activated(self._at(self._raw(positions, times)[..., : self.time_terms], times)[..., 0])
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3), directions (..., 3) and times (...,)."""
@@ -278,8 +276,11 @@ class GridFieldAtTime(RadianceField):
         waves = field._waves(field.low.new_tensor(time)).to(last.weight.dtype)
         self.field = field
         self.time = time
-        self.register_buffer("weight", torch.einsum("ckh,k->ch", last.weight.detach().unflatten(0, (4, -1)), waves))
-        self.register_buffer("bias", last.bias.detach().unflatten(0, (4, -1)) @ waves)
+        with torch.autocast(waves.device.type, enabled=False):
+            weight = torch.einsum("ckh,k->ch", last.weight.detach().unflatten(0, (4, -1)), waves)
+            bias = last.bias.detach().unflatten(0, (4, -1)) @ waves
+        self.register_buffer("weight", weight)
+        self.register_buffer("bias", bias)
         self.weight: Tensor
         self.bias: Tensor
 

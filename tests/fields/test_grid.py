@@ -137,7 +137,7 @@ def test_a_window_outside_the_training_is_refused(end: float) -> None:
 
 
 def test_series_are_summed_up_for_pictures_where_there_are_any() -> None:
-    for options in ({}, {"time_terms": 3, "view_degree": 1}, {"time_terms": 3, "time_frequencies": 2}):
+    for options in ({"view_degree": 1}, {"time_terms": 3, "view_degree": 1}, {"time_terms": 3, "time_frequencies": 2}):
         field = small(**options)
         assert field.at_time(0.3) is field
     frozen = small(time_terms=3).at_time(0.3)

@@ -48,13 +48,18 @@ HALVES, PAIRS = ir.VectorType(_BFloat(), LANES), ir.VectorType(_BFloat(), 2 * LA
 
 
 @cache
-def is_supported() -> bool:
-    """Whether the processor multiplies vectors in bfloat16, and not whole tiles, which matrix libraries make use of."""
+def has_vectors() -> bool:
+    """Whether the processor multiplies vectors in bfloat16."""
     if numba.config.CPU_NAME or numba.config.CPU_FEATURES:  # somebody wants code for another processor
         return False
-    features = llvmlite.binding.get_host_cpu_features()
-    has_vectors, has_tiles = (bool(features.get(name)) for name in ("avx512bf16", "amx-bf16"))
-    return has_vectors and not has_tiles and llvmlite.binding.llvm_version_info >= TESTED_LLVM
+    has_them = bool(llvmlite.binding.get_host_cpu_features().get("avx512bf16"))
+    return has_them and llvmlite.binding.llvm_version_info >= TESTED_LLVM
+
+
+@cache
+def is_supported() -> bool:
+    """Whether it does, and does not multiply whole tiles, which matrix libraries make use of."""
+    return has_vectors() and not llvmlite.binding.get_host_cpu_features().get("amx-bf16")
 
 
 def vectors_at_once(widths: Sequence[int]) -> int:

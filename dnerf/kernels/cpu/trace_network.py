@@ -5,7 +5,6 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
 from numba import njit, prange
 from torch import Tensor
 
