@@ -17,6 +17,8 @@ COUNTED_FREE = ("empty", "new_empty", "empty_like", "empty_strided", "detach", "
 """Operations that touch no memory."""
 LAYER = "mkldnn::_linear_pointwise"
 """oneDNN's product, bias and activation in one (`dnerf.kernels.relu_layers`); torch counts no flops of it."""
+WEIGHTS_OF = {"dnerf::relu_layers": 1, "dnerf::grid_network": 4}
+"""Kernels that run whole networks, for each row of their first argument, and which argument their weights are."""
 
 
 @dataclass
@@ -67,12 +69,16 @@ class OperationCounter(TorchDispatchMode):
         is_in_place = {id(x) for x in written_in_place}
         fresh = [x for x in outputs if id(x) not in is_in_place]
         num_bytes = sum(_touched_bytes(x) for x in (*inputs, *fresh, *written_in_place))
+        dtype = inputs[0].dtype if inputs else None
         if name == LAYER:
             flops = 2 * result.numel() * args[0].shape[-1]
+        elif name in WEIGHTS_OF:
+            weights = args[WEIGHTS_OF[name]]
+            flops, dtype = 2 * len(args[0]) * sum(x.numel() for x in weights), weights[0].dtype
         else:
             counter = flop_registry.get(func._overloadpacket)
             flops = 0 if counter is None else counter(*args, **kwargs, out_val=result)
-        rate = self.rates.flops.get(inputs[0].dtype, math.inf) if inputs else math.inf
+        rate = math.inf if dtype is None else self.rates.flops.get(dtype, math.inf)
         work = self.work[name]
         work.calls += 1
         work.num_bytes += num_bytes

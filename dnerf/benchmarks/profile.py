@@ -23,7 +23,9 @@ OTHER = "other element-wise operations"
 PARTS: dict[str, tuple[str, ...]] = {
     "matrix products": (
         "aten::mm", "aten::addmm", "aten::bmm", "aten::baddbmm", "aten::_addmm_activation", LAYER,
+        "dnerf::relu_layers",
     ),
+    "densities without gradients: grid encoding and its network": ("dnerf::grid_network",),
     "grid encoding, forward": ("dnerf::grid_encode", "dnerf::grid_encode_rounded"),
     "grid encoding, gradient to the table": ("dnerf::grid_encode_grad_table",),
     "grid encoding, gradient to positions": ("dnerf::grid_encode_grad_positions",),

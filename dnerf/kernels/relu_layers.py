@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from .backend import choose, run_compiled
+from .op import op
 
 # oneDNN's ReLU makes zeros of NaNs; with a slope below zero, however small, it keeps them.
 SLOPE = 1e-30
@@ -71,12 +72,22 @@ def is_bfloat16_wanted(inputs: Tensor) -> bool:
 def _run(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, is_kept: bool) -> list[Tensor]:
     """The last layer's outputs, or those of all."""
     if inputs.is_cpu and run_compiled("relu_layers", "serves", inputs, weights):
-        return run_compiled("relu_layers", "relu_layers", inputs, weights, biases, is_kept)
+        return torch.ops.dnerf.relu_layers(inputs, list(weights), list(biases), is_kept)
     outputs = [inputs]
     for weight, bias in zip(weights, biases, strict=True):
         # Without those before, each takes the memory of the one before the last, which is still near.
         outputs = [*(outputs if is_kept else []), _layer(outputs[-1], weight, bias)]
     return outputs[1:] if is_kept else outputs
+
+
+@op("dnerf::relu_layers")
+def _relu_layers(inputs: Tensor, weights: list[Tensor], biases: list[Tensor], is_kept: bool) -> list[Tensor]:
+    return run_compiled("relu_layers", "relu_layers", inputs, weights, biases, is_kept)
+
+
+@_relu_layers.register_fake
+def _(inputs: Tensor, weights: list[Tensor], biases: list[Tensor], is_kept: bool) -> list[Tensor]:
+    return [inputs.new_empty(len(inputs), len(weight)) for weight in (weights if is_kept else weights[-1:])]
 
 
 def _layer(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

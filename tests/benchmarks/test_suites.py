@@ -14,7 +14,8 @@ from dnerf.benchmarks.profile import PARTS
 from dnerf.benchmarks.quadrature import samples_needed
 from dnerf.benchmarks.scaling import measure
 from dnerf.benchmarks.smooth import SmoothClouds, exact_smooth
-from dnerf.kernels import GridLevels, grid_encode, is_bfloat16_wanted, packed_weights, relu_layers
+from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, packed_weights, relu_layers
+from dnerf.kernels.cpu.dense import has_vectors
 from dnerf.rays import Rays
 
 RATES = Rates({torch.float32: 1e9}, bandwidth=1e9, cached_bandwidth=1e9)
@@ -63,12 +64,27 @@ def test_products_of_fused_layers_are_counted():
         if not is_bfloat16_wanted(inputs):
             pytest.skip("oneDNN has no bfloat16 on this processor")
         relu_layers(inputs, weights, biases)
-    assert counter.work[LAYER].calls == 2
+    assert counter.work[LAYER].calls == 2  # of widths that no kernel for vectors serves
     assert counter.work[LAYER].flops == 2 * 32 * (16 * 24 + 24 * 8)
 
 
+@pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
+def test_products_of_whole_networks_are_counted(monkeypatch):
+    for kernel in ("relu_layers", "grid_network"):
+        monkeypatch.setattr(f"dnerf.kernels.cpu.{kernel}.is_supported", lambda: True)
+    levels = GridLevels((4, 8), 1 << 12)
+    weights, biases = [torch.rand(32, 16), torch.rand(16, 32), torch.rand(4, 16)], [torch.rand(n) for n in (32, 16, 4)]
+    counter = OperationCounter(RATES)
+    with counter, torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        relu_layers(torch.rand(40, 16), weights[:2], biases[:2])
+        grid_network(torch.rand(70, 3), torch.rand(levels.num_rows, 8), levels, weights, biases)
+    assert counter.work["dnerf::relu_layers"].flops == 2 * 40 * (16 * 32 + 32 * 16)
+    assert counter.work["dnerf::grid_network"].flops == 2 * 70 * (16 * 32 + 32 * 16 + 16 * 4)
+    assert LAYER not in counter.work
+
+
 def test_profile_names_the_part_of_every_kernel_that_training_runs():
-    of_pictures = {"dnerf::brick_lookup", "dnerf::trace", "dnerf::march_to_size"}
+    of_pictures = {"dnerf::brick_lookup", "dnerf::trace", "dnerf::trace_network", "dnerf::march_to_size"}
     kernels = {name for name in torch._C._dispatch_get_all_op_names() if name.startswith("dnerf::")}
     named = {name for names in PARTS.values() for name in names}
     assert of_pictures < kernels

@@ -146,6 +146,14 @@ def test_vectors_keep_nan_to_its_row_and_infinity(monkeypatch: pytest.MonkeyPatc
     assert not bool(is_finite[7])
 
 
+@pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
+@pytest.mark.parametrize("is_kept", [False, True])
+def test_op_is_registered_properly(is_kept: bool) -> None:
+    weights, biases = parameters(layers(6, 32, 16).bfloat16())
+    arguments = (torch.randn(30, 6).bfloat16(), [w.detach() for w in weights], [b.detach() for b in biases], is_kept)
+    torch.library.opcheck(torch.ops.dnerf.relu_layers.default, arguments)
+
+
 def test_code_for_another_processor_does_without_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("numba.config.CPU_NAME", "generic")
     assert not has_vectors.__wrapped__()

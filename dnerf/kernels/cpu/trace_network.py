@@ -32,6 +32,7 @@ from .tasks import next_task, none_taken
 NOWHERE = np.float32(np.nan)  # outside the lattice
 MOST = np.float32(MOST_LOG_DENSITY)
 LEFT_OUT, WHOLE, CUT, ELSEWHERE = 0, 1, 2, 3
+UNKNOWN = 4  # the line of values behind density and colours
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
@@ -76,17 +77,15 @@ def trace_network(
 
 
 def _scratch(workers: int, splits: int, num_words: int, num_moved: int) -> tuple[np.ndarray, ...]:
-    """Each worker's: rays, what becomes of their intervals, and owners of parts; bits of kept intervals; where those
-    begin and how long they are; values of the intervals; of their parts; distances of places; a row of the lattice;
-    cells."""
+    """Each worker's, see `_trace`."""
     return (
         np.empty((workers, 2, PLACES), np.int64),
-        np.empty((workers, splits * PLACES), np.int64),
         np.empty((workers, PLACES, num_words), np.uint64),
         np.empty((workers, 2, PLACES), np.float32),
+        np.empty((workers, splits * PLACES), np.int64),
+        np.empty((workers, splits * PLACES), np.float32),
         np.empty((workers, 5, PLACES), np.float32),
         np.empty((workers, splits, 5, PLACES), np.float32),
-        np.empty((workers, splits * PLACES), np.float32),
         np.empty((workers, num_moved + LINE), np.float32),
         cells_of_workers(workers),
     )
@@ -99,30 +98,32 @@ def _trace(
     room: Any, tables: Any, taken: Any, columns: Any, lanes: Any, group: Any, vectors: Any, last_group: Any,
     last_vectors: Any,
 ) -> None:  # fmt: skip
-    splits, min_weight, split_weight, stop_transmittance = options
+    """Each worker has up to `PLACES` rays under way: their `numbers`, the bits of their `kept` intervals that are still to
+    come, and of the one they are at `spans`, where it begins and how long it is, and `kinds`, what becomes of it."""
     origins, directions, near, ranges, counts = rays
     occupancy, shape, skips, bounds, aabb, step = grid
     displacements, level, low, sides = lattice
     num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
     for worker in prange(len(room[0])):
-        frozen, widths = (displacements, level, low, sides), (lanes, group, vectors, last_group, last_vectors)
-        work = tables[0][worker], tables[1][worker], tables[2][worker]
-        own = room[0][worker], room[1][worker], room[2][worker]
-        numbers, kinds, owners, kept = (
+        numbers, kinds, kept, spans = (
             scratch[0][worker, 0],
             scratch[0][worker, 1],
             scratch[1][worker],
             scratch[2][worker],
         )
-        firsts, lengths, values, part_values = (
-            scratch[3][worker, 0],
-            scratch[3][worker, 1],
-            scratch[4][worker],
-            scratch[5][worker],
+        owners, distances = scratch[3][worker], scratch[4][worker]  # of the places that are asked
+        values, part_values, moved, cells = (
+            scratch[5][worker], scratch[6][worker], scratch[7][worker], scratch[8][worker],
+        )  # fmt: skip
+        asked = (
+            (origins, directions, numbers, owners, distances),
+            (displacements, level, low, sides, columns, moved),
+            field,
+            (network, (lanes, group, vectors, last_group, last_vectors)),
+            (tables[0][worker], tables[1][worker], tables[2][worker]),
+            (room[0][worker], room[1][worker], room[2][worker]),
         )
-        distances, moved, cells = scratch[6][worker], scratch[7][worker], scratch[8][worker]
-        active, r, last = 0, 0, 0
-        has_more = True
+        active, r, last, has_more = 0, 0, 0, True
         while True:
             while has_more and active < PLACES:
                 if r == last:
@@ -141,66 +142,83 @@ def _trace(
             if active == 0:
                 break
             for s in range(active):
-                n = numbers[s]
-                j = _take(kept[s])
+                n, j = numbers[s], _take(kept[s])
                 start, end = interval(near[n], ZERO, step, ranges[n, 0], ranges[n, 1], ranges[n, 2] + np.float32(j))
-                firsts[s], lengths[s], distances[s], owners[s] = start, end - start, HALF * (start + end), s
-            _ask(
-                active, rays, numbers, owners, 0, distances, frozen, field, network, widths, columns, moved, work, own,
-                values,
-            )  # fmt: skip
-            num_parts = 0
-            for s in range(active):
-                kinds[s] = LEFT_OUT
-                if math.isnan(values[4, s]):
-                    kinds[s] = ELSEWHERE
-                    continue
-                weight = states[numbers[s], 0] * -expm1(-values[0, s] * lengths[s])
-                if splits == 1 or min_weight < weight <= split_weight:
-                    kinds[s] = WHOLE
-                elif not weight <= min_weight:  # NaN is seen
-                    kinds[s] = CUT
-                    for k in range(splits):
-                        if 2 * k + 1 != splits:  # else its middle is the interval's
-                            owners[num_parts] = s
-                            distances[num_parts] = firsts[s] + (np.float32(k) + HALF) * lengths[s] / np.float32(splits)
-                            num_parts += 1
+                spans[0, s], spans[1, s], distances[s], owners[s] = start, end - start, HALF * (start + end), s
+            _ask(active, 0, asked, values)
+            num_parts = _choose(active, numbers, spans, values, states, options, kinds, owners, distances)
             for first in range(0, num_parts, PLACES):
-                count = min(PLACES, num_parts - first)
-                _ask(
-                    count, rays, numbers, owners, first, distances, frozen, field, network, widths, columns, moved, work,
-                    own, part_values[first // PLACES],
-                )  # fmt: skip
-            part = 0
-            for s in range(active):
-                state = states[numbers[s]]
-                if kinds[s] == WHOLE:
-                    _add(state, values, s, firsts[s] + HALF * lengths[s], lengths[s])
-                elif kinds[s] == CUT:
-                    length, is_known = lengths[s] / np.float32(splits), True
-                    for k in range(splits):
-                        middle = firsts[s] + (np.float32(k) + HALF) * length
-                        if 2 * k + 1 == splits:
-                            _add(state, values, s, middle, length)
-                        else:
-                            found, i = part_values[part // PLACES], part % PLACES
-                            is_known = is_known and not math.isnan(found[4, i])
-                            _add(state, found, i, middle, length)
-                            part += 1
-                    if not is_known:
-                        kinds[s] = ELSEWHERE
-            s = 0
-            while s < active:
-                n = numbers[s]
-                if kinds[s] == ELSEWHERE:
-                    is_done[n] = False
-                if kinds[s] != ELSEWHERE and states[n, 0] > stop_transmittance and _any(kept[s]):
-                    s += 1
-                    continue
-                active -= 1
-                numbers[s], kinds[s] = numbers[active], kinds[active]
-                for k in range(kept.shape[1]):
-                    kept[s, k] = kept[active, k]
+                _ask(min(PLACES, num_parts - first), first, asked, part_values[first // PLACES])
+            _composite(active, numbers, spans, values, part_values, options[0], kinds, states)
+            active = _go_on(active, numbers, kept, kinds, states, options[3], is_done)
+
+
+@njit(**BORROWS)
+def _choose(
+    active: int, numbers: Any, spans: Any, values: Any, states: Any, options: Any, kinds: Any, owners: Any,
+    distances: Any,
+) -> int:  # fmt: skip
+    """Decide what becomes of intervals; where and of which ray parts of those are that are cut, and how many."""
+    splits, min_weight, split_weight, _ = options
+    num_parts = 0
+    for s in range(active):
+        if math.isnan(values[UNKNOWN, s]):
+            kinds[s] = ELSEWHERE
+            continue
+        weight = states[numbers[s], 0] * -expm1(-values[0, s] * spans[1, s])
+        if splits == 1 or min_weight < weight <= split_weight:
+            kinds[s] = WHOLE
+        elif weight <= min_weight:
+            kinds[s] = LEFT_OUT
+        else:  # also NaN, which is seen
+            kinds[s] = CUT
+            length = spans[1, s] / np.float32(splits)
+            for k in range(splits):
+                if 2 * k + 1 != splits:  # else its middle is the interval's
+                    owners[num_parts], distances[num_parts] = s, _part(spans[0, s], k, length)
+                    num_parts += 1
+    return num_parts
+
+
+@njit(**BORROWS)
+def _composite(
+    active: int, numbers: Any, spans: Any, values: Any, part_values: Any, splits: int, kinds: Any, states: Any
+) -> None:
+    """Composite intervals and parts behind their rays' states; a ray of which a part is not known goes elsewhere."""
+    part = 0
+    for s in range(active):
+        state, start, length = states[numbers[s]], spans[0, s], spans[1, s]
+        if kinds[s] == WHOLE:
+            _add(state, values, s, start + HALF * length, length)
+        if kinds[s] != CUT:
+            continue
+        length /= np.float32(splits)
+        for k in range(splits):
+            if 2 * k + 1 == splits:
+                _add(state, values, s, _part(start, k, length), length)
+                continue
+            found, i = part_values[part // PLACES], part % PLACES
+            _add(state, found, i, _part(start, k, length), length)
+            if math.isnan(found[UNKNOWN, i]):
+                kinds[s] = ELSEWHERE
+            part += 1
+
+
+@njit(**BORROWS)
+def _go_on(active: int, numbers: Any, kept: Any, kinds: Any, states: Any, stop_transmittance: Any, is_done: Any) -> int:
+    """Let rays that have ended leave, the last ones taking their places; how many go on."""
+    s = 0
+    while s < active:
+        if kinds[s] == ELSEWHERE:
+            is_done[numbers[s]] = False
+        elif states[numbers[s], 0] > stop_transmittance and _any(kept[s]):
+            s += 1
+            continue
+        active -= 1
+        numbers[s], kinds[s] = numbers[active], kinds[active]
+        for k in range(kept.shape[1]):
+            kept[s, k] = kept[active, k]
+    return active
 
 
 @njit(**BORROWS)
@@ -208,15 +226,14 @@ def _mark(j: int, count: int, course: Any, occupancy: Any, skips: Any, cells: An
     """Set the bits of a ray's kept intervals; whether there are any."""
     for k in range(len(kept)):
         kept[k] = 0
-    any_ = False
     while True:
         j, bits = next_kept(j, count, course, occupancy, skips, cells)
         if bits == 0:
-            return any_
-        any_ = True
-        kept[j >> 6] |= bits << np.uint64(j & 63)
-        if j & 63 > 64 - TESTED_AT_ONCE:
-            kept[(j >> 6) + 1] |= bits >> np.uint64(64 - (j & 63))
+            return _any(kept)
+        word, shift = j >> 6, j & 63
+        kept[word] |= bits << np.uint64(shift)
+        if shift > 64 - TESTED_AT_ONCE:
+            kept[word + 1] |= bits >> np.uint64(64 - shift)
         j += TESTED_AT_ONCE
 
 
@@ -233,6 +250,7 @@ def _take(kept: Any) -> int:
 
 @njit(**BORROWS)
 def _any(kept: Any) -> bool:
+    """Whether any bit is set."""
     for k in range(len(kept)):
         if kept[k]:
             return True
@@ -240,14 +258,10 @@ def _any(kept: Any) -> bool:
 
 
 @njit(**BORROWS)
-def _ask(
-    count: int, rays: Any, numbers: Any, owners: Any, first: int, distances: Any, lattice: Any, field: Any, network: Any,
-    widths: Any, columns: Any, moved: Any, work: Any, own: Any, values: Any,
-) -> None:  # fmt: skip
-    """Density and colours at so many places, and what is NaN where it is not known: (5, n)."""
-    origins, directions = rays[:2]
-    displacements, level, low, sides = lattice
-    field_low, scale, shifts = field
+def _ask(count: int, first: int, asked: Any, values: Any) -> None:
+    """Density and colours at so many places, from one on, and what is NaN where nothing is known of them: (5, n)."""
+    (origins, directions, numbers, owners, distances), lattice, (field_low, scale, shifts), nets, work, own = asked
+    displacements, level, low, sides, columns, moved = lattice
     places, fractions, rows = work
     encoded, hidden, found = own
     for i in range(count):
@@ -267,8 +281,8 @@ def _ask(
             place = (values[1 + axis, i] + moved[axis] - field_low[axis]) * scale[axis]
             places[axis, i] = clamped(place)
             total += place
-        values[4, i] = total - total  # NaN of what is no number
-    ask_network(count, network, widths, (places, fractions, rows), encoded, hidden, found)
+        values[UNKNOWN, i] = total - total  # NaN of what is no number
+    ask_network(count, nets[0], nets[1], work, encoded, hidden, found)
     for i in range(count):
         for k in range(4):
             values[k, i] = found[i * LANES + k] + shifts[k]
@@ -279,6 +293,12 @@ def _ask(
         colors = values[k, :count]
         for i in range(len(colors)):
             colors[i] = sigmoid(colors[i])
+
+
+@njit(forceinline=True, **BORROWS)
+def _part(start: Any, k: int, length: Any) -> Any:
+    """Where the middle of a part of an interval is."""
+    return start + (np.float32(k) + HALF) * length
 
 
 @njit(forceinline=True, **BORROWS)
