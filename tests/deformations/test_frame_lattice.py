@@ -231,7 +231,9 @@ def test_pictures_hardly_change_and_training_does_not_see_it(packed: bool) -> No
 
 def test_what_does_not_move_is_not_cached() -> None:
     field = DeformedField(IdentityDeformation(), GridField(BOX), frame_lattice=FrameLattice(BOX))
-    assert field.at_time(0.5) is field
+    frozen = field.at_time(0.5)
+    assert isinstance(frozen, DeformedField)
+    assert frozen.deformation is field.deformation
 
 
 def test_a_deformation_that_fails_once_is_asked_again() -> None:

@@ -212,7 +212,7 @@ def test_table_gradient_split_into_row_blocks_is_the_same():
 
     positions, table = (x.numpy() for x in example(500))
     grad = torch.randn(500, 9, dtype=torch.float64).numpy()
-    levels = cpu._levels(tuple(LEVELS.cells), LEVELS.max_rows)
+    levels = cpu.levels_of(tuple(LEVELS.cells), LEVELS.max_rows)
     whole, parts = (
         torch.zeros(table.shape, dtype=torch.float64),
         torch.zeros(table.shape, dtype=torch.float64),

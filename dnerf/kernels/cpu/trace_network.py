@@ -98,8 +98,8 @@ def _trace(
     room: Any, tables: Any, taken: Any, columns: Any, lanes: Any, group: Any, vectors: Any, last_group: Any,
     last_vectors: Any,
 ) -> None:  # fmt: skip
-    """Each worker has up to `PLACES` rays under way: their `numbers`, the bits of their `kept` intervals that are still to
-    come, and of the one they are at `spans`, where it begins and how long it is, and `kinds`, what becomes of it."""
+    """Each worker has up to `PLACES` rays under way: their `numbers`, the bits of the `kept` intervals that are still
+    to come, and of those they are at `spans`, where they begin and how long they are, and what becomes of them."""
     origins, directions, near, ranges, counts = rays
     occupancy, shape, skips, bounds, aabb, step = grid
     displacements, level, low, sides = lattice
