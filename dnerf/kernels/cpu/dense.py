@@ -1,9 +1,9 @@
 # mypy: disable-error-code="attr-defined,call-arg"
 """Layers of networks in bfloat16, for use inside numba kernels, on processors that multiply vectors of such numbers.
 
-Matrix libraries are made for large matrices: of layers as narrow as a radiance field's they reach a third of what
-the processor can do. Here a group of rows stays in registers while a layer's weights, which fit the nearest cache, pass
-by, and a few hundred rows go through all layers before the next ones begin.
+Matrix libraries go through all rows layer by layer, and through memory in between, which takes narrow layers as long as
+their arithmetic. Here sums for a group of rows stay in registers while a layer's weights pass by, which fit the nearest
+cache, and a few hundred rows go through all layers before the next ones begin.
 """
 
 from collections.abc import Sequence
