@@ -73,7 +73,7 @@ def run(settings: Settings) -> SuiteResult:
             "their error is what a setting loses; `as trained` is the grid that training left behind, without its "
             "margin in space if the experiment renders so; `the experiment's own` adds its cut-off and the lattice of "
             "its deformation, and for a sequence that of canonical space, filled before the clock starts, unless haze "
-            "forbids it. The "
+            "forbids it or a kernel asks the field itself as quickly. The "
             f"reference samples the whole box at the experiment's shortest step, {_shortest(trained):g}, and leaves "
             "out nothing: errors are of pruning alone, not of the model. The experiment's own settings: threshold "
             f"{trained.threshold:g}, {int(trained.shape[1:].max())} cells, {int(trained.shape[0])} slabs, cut-off "
