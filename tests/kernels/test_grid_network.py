@@ -1,5 +1,7 @@
 """A network on a grid's features in one kernel against one part after the other."""
 
+import itertools
+
 import pytest
 import torch
 from torch import Tensor
@@ -20,7 +22,7 @@ def fused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def network(widths: tuple[int, ...], seed: int = 0) -> tuple[list[Tensor], list[Tensor]]:
     generator = torch.Generator().manual_seed(seed)
-    weights = [torch.randn(b, a, generator=generator) / a**0.5 for a, b in zip(widths, widths[1:], strict=False)]
+    weights = [torch.randn(b, a, generator=generator) / a**0.5 for a, b in itertools.pairwise(widths)]
     return weights, [torch.randn(b, generator=generator) for b in widths[1:]]
 
 

@@ -1,5 +1,6 @@
 """Rays through a lattice and a network in one kernel against its definition, one interval after the other."""
 
+import itertools
 import sys
 from collections.abc import Iterator
 
@@ -50,7 +51,7 @@ def scene(seed: int = 0, *, known: float = 1.0, share: float = 0.3, density: flo
         table=torch.randn(LEVELS.num_rows, 4, generator=generator),
         shifts=torch.tensor([density, 0.1, -0.1, 0.3]),
         levels=LEVELS,
-        weights=[torch.randn(b, a, generator=generator) / a**0.5 for a, b in zip(WIDTHS, WIDTHS[1:], strict=False)],
+        weights=[torch.randn(b, a, generator=generator) / a**0.5 for a, b in itertools.pairwise(WIDTHS)],
         biases=[torch.randn(b, generator=generator) for b in WIDTHS[1:]],
     )
 

@@ -251,10 +251,7 @@ def _take(kept: Any) -> int:
 @njit(**BORROWS)
 def _any(kept: Any) -> bool:
     """Whether any bit is set."""
-    for k in range(len(kept)):
-        if kept[k]:
-            return True
-    return False
+    return any(kept[k] for k in range(len(kept)))
 
 
 @njit(**BORROWS)
