@@ -251,7 +251,10 @@ def _take(kept: Any) -> int:
 @njit(**BORROWS)
 def _any(kept: Any) -> bool:
     """Whether any bit is set."""
-    return any(kept[k] for k in range(len(kept)))
+    bits = np.uint64(0)
+    for k in range(len(kept)):
+        bits |= kept[k]
+    return bits != 0
 
 
 @njit(**BORROWS)
