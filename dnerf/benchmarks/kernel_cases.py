@@ -3,12 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from dnerf.benchmarks.network_cases import network_call, network_tracing_call
 from dnerf.benchmarks.plain_kernels import corner_rows, plain_grid_encode, plain_packed_weights
 from dnerf.benchmarks.suite import Settings
 from dnerf.cameras import Camera, Intrinsics, look_at
@@ -17,14 +17,12 @@ from dnerf.kernels import (
     FrameTables,
     GridLevels,
     MarchedSamples,
-    NetworkTables,
     add_seen,
     brick_lookup,
     covered_places,
     few_nonzero,
     footprints,
     grid_encode,
-    grid_network,
     lattice_places,
     march,
     march_to_size,
@@ -36,7 +34,6 @@ from dnerf.kernels import (
     skip_distances,
     thin_out,
     trace,
-    trace_network,
     use_backend,
 )
 from dnerf.kernels.brick_lookup import BRICK, VERTICES
@@ -52,7 +49,6 @@ MAX_ROWS = 1 << 17
 STEP = 0.03
 SPACING = 0.06  # along a ray, of samples whose deformation is asked
 WIDTHS = (32, 128, 128, 128, 128)  # of the network of a deformation
-HEAD = (64, 64, 4)  # of the network of a field, behind its features
 LATTICE = 384  # cells per side of the bricks' lattice
 CONTENTS = 16  # numbers of each of its vertices
 DISPLACEMENTS = 80  # cells per side of the displacements' lattice
@@ -231,6 +227,9 @@ class Workload:
         activations = self.num_samples * (2 * WIDTHS[0] + 2 * WIDTHS[-1])
         rows = (torch.unique(rows).numel() for rows, _ in corner_rows(self.positions, self.levels))
         used = 4 * NUM_FEATURES * sum(rows)
+        network_tracer = network_tracing_call(
+            self.rays, (self.occupancy[0], self.skips[0], self.box), (self.table, self.levels), DISPLACEMENTS + 1, STEP
+        )
         return [
             Case("thin_out", "forward", _backends(lambda: thin_out(self.points, times, SPACING)), (4 + 2 + 1 + 1) * n),
             Case(
@@ -257,8 +256,13 @@ class Workload:
             Case("shade", "forward", _backends(lambda: shade(products, torch.zeros(4), -1.0)), 24 * self.num_samples),
             Case("footprints", "forward", _backends(view), occupied.nbytes + 16 * seen),
             Case("trace", "forward", _backends(self._tracer()), 10 * 4 * len(self.rays) + contents),
-            Case("grid_network", "forward", _backends(self._network()), 3 * n + self.num_samples * 4 * 4 + used),
-            Case("trace_network", "forward", _backends(self._network_tracer()), 10 * 4 * len(self.rays) + used),
+            Case(
+                "grid_network",
+                "forward",
+                _backends(network_call(self.positions, self.table, self.levels)),
+                3 * n + self.num_samples * 4 * 4 + used,
+            ),
+            Case("trace_network", "forward", _backends(network_tracer), 10 * 4 * len(self.rays) + used),
             *_both(
                 "relu_layers",
                 _in_bfloat16,
@@ -284,44 +288,6 @@ class Workload:
             r.origins, r.directions, r.near, r.far, states, numbers, tables, step=STEP, splits=1, min_weight=0.0,
             split_weight=0.0, cells_per_unit=LATTICE / float(sides[0]), log_shift=-10.0, stop_transmittance=1e-4,
         )  # fmt: skip
-
-    def _head(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Weights and biases of a field's network, its features those of the grid."""
-        widths = (self.levels.num_levels * NUM_FEATURES, *HEAD)
-        generator = torch.Generator().manual_seed(0)
-        weights = [torch.randn(b, a, generator=generator) / a**0.5 for a, b in pairwise(widths)]
-        return weights, [torch.zeros(b) for b in widths[1:]]
-
-    def _network(self) -> Call:
-        weights, biases = self._head()
-
-        def call() -> Tensor:
-            with torch.autocast("cpu", torch.bfloat16):
-                return grid_network(self.positions, self.table, self.levels, weights, biases)
-
-        return call
-
-    def _network_tracer(self) -> Call:
-        """The same rays, asking a network: matter is thin, displacements are zero and steps stay whole."""
-        side = DISPLACEMENTS + 1
-        low, sides = self.box[0], self.box[1] - self.box[0]
-        weights, biases = self._head()
-        tables = NetworkTables(
-            occupancy=self.occupancy[0], skips=self.skips[0], aabb=self.box, low=low, sides=sides, levels=self.levels,
-            displacements=torch.zeros(side**3, 4), is_known=torch.ones(side, side, side, dtype=torch.bool),
-            field_low=low, field_scale=1 / sides, table=self.table, weights=weights, biases=biases,
-            shifts=torch.tensor([-10.0, 0.0, 0.0, 0.0]),
-        )  # fmt: skip
-        r, is_left = self.rays, torch.zeros(len(self.rays), dtype=torch.bool)
-
-        def call() -> tuple[Tensor, Tensor]:
-            with torch.autocast("cpu", torch.bfloat16):
-                return trace_network(
-                    r.origins, r.directions, r.near, r.far, is_left, tables, step=STEP, splits=1, min_weight=0.0,
-                    split_weight=0.0, stop_transmittance=1e-4,
-                )  # fmt: skip
-
-        return call
 
 
 def _in_bfloat16(inputs: Tensor, *parameters: Tensor) -> Tensor:
