@@ -14,8 +14,8 @@ from dnerf.fields.baked import BakedField
 from dnerf.fields.grid import GridFieldAtTime
 from dnerf.kernels import FrameTables, MarchGrid, NetworkTables, few_nonzero, trace, trace_network
 from dnerf.kernels.backend import choose
+from dnerf.kernels.grid_network import is_fused
 from dnerf.kernels.trace import DONE, ELSEWHERE, NUM_STATES
-from dnerf.kernels.trace_network import serves
 from dnerf.rays import Rays
 
 Tracer = Callable[[Rays], tuple[Tensor, Tensor]]
@@ -258,4 +258,4 @@ def _tables(canonical: RadianceField) -> dict[str, Any] | None:
     tables = canonical.tables() if isinstance(canonical, GridFieldAtTime) else None
     if tables is None or any(tables[name].dtype != torch.float32 for name in ("table", "field_low", "shifts")):
         return None
-    return tables if serves(tables["table"], tables["weights"][0].shape[1], tables["weights"]) else None
+    return tables if is_fused(tables["table"], tables["weights"][0].shape[1], tables["weights"]) else None

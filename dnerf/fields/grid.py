@@ -144,9 +144,7 @@ class GridField(RadianceField):
 
     def _inputs(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """What the head sees (..., n), and the scale (n,) of each column; without times, that without `space_time`."""
-        features = grid_encode(
-            self._unit(positions), self.table, self.levels, rounded=is_bfloat16_wanted(positions)
-        )  # fmt: skip
+        features = grid_encode(self._unit(positions), self.table, self.levels, rounded=is_bfloat16_wanted(positions))
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
         scale = self._feature_scale
         if self.encode_times is not None:

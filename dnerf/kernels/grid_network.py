@@ -39,7 +39,7 @@ def grid_network(
     in_features = levels.num_levels * table.shape[-1]
     if weights[0].shape[-1] != in_features:
         raise ValueError(f"the first weights must have {in_features} columns, got {tuple(weights[0].shape)}")
-    if all(x.dtype == torch.float32 for x in (positions, table)) and _is_fused(positions, in_features, weights):
+    if all(x.dtype == torch.float32 for x in (positions, table)) and is_fused(positions, in_features, weights):
         check_grid(positions, table, levels)
         rounded = [[x.bfloat16() for x in parameters] for parameters in (weights, biases)]
         return torch.ops.dnerf.grid_network(positions, table, levels.cells, levels.max_rows, *rounded)
@@ -55,7 +55,8 @@ def grid_network_reference(
     return torch.nn.functional.linear(hidden, weights[-1], biases[-1])
 
 
-def _is_fused(positions: Tensor, in_features: int, weights: Sequence[Tensor]) -> bool:
+def is_fused(positions: Tensor, in_features: int, weights: Sequence[Tensor]) -> bool:
+    """Whether a kernel is compiled for such networks, in the precision and on the processor of now."""
     if not is_bfloat16_wanted(positions) or positions.is_cuda or choose(positions) != "numba":
         return False
     return run_compiled("grid_network", "serves", positions, in_features, weights)

@@ -6,17 +6,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import choose, run_compiled
+from .backend import run_compiled
 from .grid_encode import GridLevels, check_grid
-from .grid_network import grid_network_reference
+from .grid_network import grid_network_reference, is_fused
 from .lattice_places import lattice_places_reference
 from .march import kept_intervals
 from .op import op
-from .relu_layers import is_bfloat16_wanted
 from .shade import shade_reference
 from .skip_distances import blocks_shape
-
-NUM_STATES = 5
+from .trace import NUM_STATES
 
 
 @dataclass(frozen=True)
@@ -87,13 +85,6 @@ class NetworkTables:
         ]  # fmt: skip
 
 
-def serves(positions: Tensor, in_features: int, weights: list[Tensor]) -> bool:
-    """Whether a kernel is compiled for such networks, in the precision and on the processor of now."""
-    if not is_bfloat16_wanted(positions) or positions.is_cuda or choose(positions) != "numba":
-        return False
-    return run_compiled("grid_network", "serves", positions, in_features, weights)
-
-
 @torch.no_grad()
 def trace_network(
     origins: Tensor,
@@ -150,7 +141,7 @@ def trace_network(
     rays = [x.float() for x in (origins, directions, near, far)]
     scalars = [float(x) for x in (step, min_weight, split_weight, stop_transmittance)]
     levels, in_features = tables.levels, tables.weights[0].shape[1]
-    if tables.table.dtype == torch.float32 and serves(rays[0], in_features, tables.weights):
+    if tables.table.dtype == torch.float32 and is_fused(rays[0], in_features, tables.weights):
         rounded = [[x.bfloat16() for x in parameters] for parameters in (tables.weights, tables.biases)]
         return torch.ops.dnerf.trace_network(
             is_left, rays, tables.tensors(), levels.cells, levels.max_rows, *rounded, splits, scalars

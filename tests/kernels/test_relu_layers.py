@@ -154,6 +154,19 @@ def test_op_is_registered_properly(is_kept: bool) -> None:
     torch.library.opcheck(torch.ops.dnerf.relu_layers.default, arguments)
 
 
+@pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
+@pytest.mark.parametrize(
+    ("shapes", "message"), [(((32, 8), (16, 48)), r"\(n, 32\)"), (((32, 6), (16, 32)), r"\(n, 8\)")]
+)
+def test_layers_that_do_not_fit_are_refused(
+    shapes: tuple[tuple[int, int], ...], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dnerf.kernels.cpu.relu_layers.is_supported", lambda: True)
+    weights, biases = [torch.zeros(s) for s in shapes], [torch.zeros(s[0]) for s in shapes]
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16), pytest.raises(ValueError, match=message):
+        relu_layers(torch.zeros(20, 8), weights, biases)
+
+
 def test_code_for_another_processor_does_without_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("numba.config.CPU_NAME", "generic")
     assert not has_vectors.__wrapped__()

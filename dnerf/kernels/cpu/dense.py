@@ -43,7 +43,7 @@ class _BFloat(ir.Type):
 
 
 WORD = ir.IntType(32)
-SINGLES, WORDS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(WORD, LANES)
+SINGLES = ir.VectorType(ir.FloatType(), LANES)
 HALVES, PAIRS = ir.VectorType(_BFloat(), LANES), ir.VectorType(_BFloat(), 2 * LANES)
 
 
@@ -71,6 +71,7 @@ class Packed:
     """Weights and biases of layers as `dense` reads them.
 
     Args:
+        in_features: of the first layer.
         weights: of each layer, (out_features, in_features) in bfloat16, an even number of inputs.
         biases: of each layer, (out_features,).
         vectors: of outputs that each layer finds at once; the last outputs are padded with zeros.
@@ -79,9 +80,15 @@ class Packed:
         weights: flat, uint16: block of outputs by block, pair of inputs by pair.
         biases: flat, float32.
         layers: (L, 4) int64: pairs of inputs, blocks of outputs, and where weights and biases begin.
+
+    Raises:
+        ValueError: for layers that do not fit each other.
     """
 
-    def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], vectors: Sequence[int]) -> None:
+    def __init__(
+        self, in_features: int, weights: Sequence[Tensor], biases: Sequence[Tensor], vectors: Sequence[int]
+    ) -> None:
+        _check(in_features, weights, biases)
         layers, num_weights, num_outputs = [], 0, 0
         for weight, count in zip(weights, vectors, strict=True):
             out_features, in_features = weight.shape
@@ -94,6 +101,16 @@ class Packed:
         for (_, _, start, first), weight, bias, count in zip(layers, weights, biases, vectors, strict=True):
             _pack(bits_of(weight), self.weights[start:], count * LANES)
             self.biases[first : first + len(bias)] = bias.detach().bfloat16().float().numpy()
+
+
+def _check(in_features: int, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
+    for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        if weight.ndim != 2 or weight.shape[1] != in_features or bias.shape != (len(weight),):
+            raise ValueError(
+                f"weights and biases of layer {i} must have shapes (n, {in_features}) and (n,), got "
+                f"{tuple(weight.shape)} and {tuple(bias.shape)}"
+            )
+        in_features = len(weight)
 
 
 def bits_of(tensor: Tensor) -> np.ndarray:

@@ -32,8 +32,8 @@ def network_of(
 ) -> tuple[tuple[np.ndarray, ...], Widths]:
     """What `ask_network` reads, and the lengths of vectors and groups, as tuples: constants to the compiler."""
     vectors = vectors_at_once([len(weight) for weight in weights[:-1]])
-    packed = Packed(weights, biases, [vectors] * (len(weights) - 1) + [1])
     levels = levels_of(tuple(cells), max_rows)
+    packed = Packed(len(levels) * table.shape[1], weights, biases, [vectors] * (len(weights) - 1) + [1])
     arrays = table.detach().contiguous().numpy(), levels, packed.layers, packed.weights, packed.biases
     return arrays, tuple((0,) * n for n in (table.shape[1], ROWS_OF[vectors], vectors, ROWS_OF[1], 1))
 

@@ -30,7 +30,7 @@ def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tens
     outputs = [inputs.new_empty(len(inputs), n) for n in (widths if is_kept else widths[-1:])]
     between = [] if is_kept else [np.empty(workers * (ROWS + MOST_ROWS) * n, np.uint16) for n in widths[:-1]]
     arrays = (bits_of(inputs).ravel(), *between, *(bits_of(x).ravel() for x in outputs))
-    packed = Packed(weights, biases, [vectors] * len(weights))
+    packed = Packed(inputs.shape[1], weights, biases, [vectors] * len(weights))
     launch(
         _layers, arrays, len(inputs), is_kept, packed.layers, packed.weights, packed.biases, workers, none_taken(),
         (0,) * ROWS_OF[vectors], (0,) * vectors,

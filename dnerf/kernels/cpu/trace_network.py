@@ -9,7 +9,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..shade import MOST_LOG_DENSITY
-from ..trace_network import NUM_STATES
+from ..trace import NUM_STATES
 from .cells import PLACES, cell_tables, clamped, fractions_at, locate_all, rows_at
 from .course import (
     LINE,
