@@ -8,14 +8,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import torch
-from hydra import compose
 from hydra_app import build, load_config, load_renderer, resolve_device, run_app
-from omegaconf import DictConfig, OmegaConf
 
-from dnerf.benchmarks import Settings, describe_machine, run_suite, suite_names, write_report
-from dnerf.benchmarks.timing import num_threads
-from dnerf.checks import check_positive
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # `benchmarks` is no part of the installed package
+
+import torch
+import yaml
+from hydra import compose
+from omegaconf import DictConfig, OmegaConf
+from train import in_box
+
+from benchmarks import Settings, describe_machine, num_threads, run_suite, suite_names, write_report
+from dnerf.core.checks import check_positive
+from dnerf.training.distributed import Processes
 
 ALL = "all"
 
@@ -61,12 +66,23 @@ def _run(config: DictConfig, suite: str, folder: Path) -> None:
 def _parts(overrides: Sequence[str]) -> Mapping[str, Any]:
     """Renderer, trainer, data and chunk of a training config with the given overrides."""
     config = compose("train", list(overrides))
-    return {"chunk": config.chunk, **{name: build(config[name]) for name in ("renderer", "trainer", "data")}}
+    data = build(config.data, trusted=True)
+    config = in_box(config, data, data.frames("train"), Processes())
+    parts = {name: build(config[name], trusted=True) for name in ("renderer", "trainer")}
+    return {"chunk": config.chunk, "data": data, **parts}
 
 
-def _finished(run: str) -> Mapping[str, Any]:
-    """Renderer, data and chunk of a finished run."""
+def _finished(run: str, overrides: Sequence[str]) -> Mapping[str, Any]:
+    """Renderer, data and chunk of a finished run, some of whose settings are others.
+
+    Raises:
+        ValueError: for a setting that the run does not have.
+    """
     config = load_config(run)
+    for name, _, text in (change.partition("=") for change in overrides):
+        if OmegaConf.select(config, name, default=ALL) == ALL:
+            raise ValueError(f"frames.ways: {run} has no setting {name}")
+        OmegaConf.update(config, name, yaml.safe_load(text))
     renderer = load_renderer(run, config, torch.device("cpu"))
     return {"renderer": renderer, "data": build(config.data), "chunk": config.chunk}
 

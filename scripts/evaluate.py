@@ -1,30 +1,35 @@
 """Score runs on held-out frames: python scripts/evaluate.py run=runs/mutant protocol=dnerf"""
 
+import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra_app import build, load_config, load_renderer, moved, resolve_device, run_app
 from omegaconf import DictConfig
-from reporting import evaluate_run, print_scores
+from reporting import camera_split, evaluate_run, print_scores
 from torch import Tensor
 
-from dnerf.backgrounds import ConstantBackground
-from dnerf.cameras import Camera
-from dnerf.data import DataSource, Frames, SyntheticData
-from dnerf.evaluation import FrameScore, evaluate
-from dnerf.files import write_json, write_text
-from dnerf.logs import SHEET_COLUMNS
-from dnerf.metrics.perceptual import lpips_metric
-from dnerf.plots import frame_curves
-from dnerf.protocols import LEGO, Protocol, csv_table, find_protocol, markdown_table, table_json, table_notes
-from dnerf.provenance import provenance
-from dnerf.renderer import Renderer
-from dnerf.temporal_evaluation import evaluate_over_time
-from dnerf.video import contact_sheet, error_map, write_png
+from dnerf.core.backgrounds import ConstantBackground
+from dnerf.core.cameras import Camera
+from dnerf.core.compositing import Rendering
+from dnerf.core.files import write_json, write_text
+from dnerf.core.rays import Rays
+from dnerf.data import DataSource, Frames, SyntheticData, random_views, render_exact
+from dnerf.evaluation import FrameScore, check_consistency, evaluate, evaluate_over_time, lpips_metric
+from dnerf.evaluation.plots import frame_curves
+from dnerf.evaluation.protocols import LEGO, Protocol, csv_table, find_protocol, markdown_table, table_json, table_notes
+from dnerf.evaluation.provenance import provenance
+from dnerf.rendering.renderer import Renderer
+from dnerf.samplers import OccupancySampler
+from dnerf.scenes import AnalyticScene
+from dnerf.visualization import comparison_sheet, write_png
 
 Lpips = Callable[[Tensor, Tensor], float] | None
+CONSISTENCY_PIXELS = 16
+"""Width of the image whose rays are checked over time."""
 
 
 def main(config: DictConfig) -> None:
@@ -78,6 +83,8 @@ def _score(config: DictConfig, run: str, protocol: Protocol | None, lpips: Lpips
         _write_curves(folder / f"curves_{split}.svg", {scene: metrics["frames"]})
     if config.temporal.enabled:
         _write_temporal(config, folder, renderer, data, chunk, settings)
+    if config.consistency:
+        _write_consistency(folder, renderer, data, settings)
     return metrics
 
 
@@ -103,15 +110,15 @@ def _write_worst(
     if count <= 0:
         return
     worst = sorted(metrics["frames"], key=lambda frame: frame["psnr"])[:count]
-    rows: list[list[Tensor]] = []
+    pairs: list[tuple[Tensor, Tensor]] = []
 
     def keep(score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
-        rows.append([prediction, truth, error_map(prediction, truth)])
+        pairs.append((prediction, truth))
 
     evaluate(renderer, frames.subset([frame["index"] for frame in worst]), chunk=chunk, on_frame=keep)
     labels = [f"frame {frame['index']}, t = {frame['time']:.2f}, {frame['psnr']:.1f} dB" for frame in worst]
     path = folder / f"worst_frames_{metrics['split']}.png"
-    write_png(contact_sheet(rows, columns=SHEET_COLUMNS, rows=labels), path)
+    write_png(comparison_sheet(pairs, labels), path)
     print(f"worst frames:  {path}")
 
 
@@ -128,20 +135,51 @@ def _write_curves(path: Path, runs: dict[str, Any]) -> None:
 def _write_temporal(
     config: DictConfig, folder: Path, renderer: Renderer, data: DataSource, chunk: int, settings: dict[str, Any]
 ) -> None:
-    frames = data.frames("test").to(renderer.device)
     size = config.temporal.resolution
-    height = round(size * frames.intrinsics.height / frames.intrinsics.width)
-    camera = Camera(frames.intrinsics.resized(size, height), frames.poses[0], frames.near, frames.far)
+    camera = _first_camera(data, size, renderer.device)
     scene = data.scene.to(renderer.device) if isinstance(data, SyntheticData) else None
     scores = evaluate_over_time(renderer, camera, scene, num_frames=config.temporal.num_frames, chunk=chunk)
-    values = {name: value for name, value in scores.as_dict().items() if value is not None}
+    values = scores.as_dict()
     write_json(folder / "temporal.json", {**values, "resolution": size, **settings, **provenance()})
     source = "exact motion" if scene is not None else "the model's own motion: consistency, not correctness"
     print(f"over time, by {source}:")
     for name, value in values.items():
-        if isinstance(value, float):
-            print(f"  {name.replace('_', ' '):22} {value:.5g}")
+        if value is None or isinstance(value, float):
+            print(f"  {name.replace('_', ' '):22} {'not measured' if value is None else f'{value:.5g}'}")
     print(f"over time:     {folder / 'temporal.json'}")
+
+
+def _first_camera(data: DataSource, width: int, device: torch.device) -> Camera:
+    """The first camera of the test split, or of the train split if there is none, with so many pixels."""
+    frames = data.frames(camera_split(None, data))
+    height = round(width * frames.intrinsics.height / frames.intrinsics.width)
+    return Camera(frames.intrinsics.resized(width, height), frames.poses[0].to(device), frames.near, frames.far)
+
+
+def _write_consistency(folder: Path, renderer: Renderer, data: DataSource, settings: dict[str, Any]) -> None:
+    truth: Callable[[Rays], Rendering] | None = None
+    times: list[float] = []
+    if isinstance(data, SyntheticData):
+        truth = partial(_exact_images, data.scene.to(renderer.device), renderer)
+        last = 1.0 if data.train_end is None else data.train_end
+        times = [time for time in random_views(data.num_frames["train"])[1].tolist() if time <= last]
+    slabs = len(renderer.sampler.grid.occupied) if isinstance(renderer.sampler, OccupancySampler) else 1
+    rays = _first_camera(data, CONSISTENCY_PIXELS, renderer.device).rays(0.0)
+    findings = check_consistency(renderer, rays, data.box, slabs=slabs, truth=truth, train_times=times)
+    print("\n".join([f"{'check':20} {'verdict':13} {'value':>9} {'bound':>9}", *map(str, findings)]))
+    listed = [{**vars(finding), "value": _finite(finding.value)} for finding in findings]
+    write_json(folder / "consistency.json", {"checks": listed, **settings, **provenance()})
+    print(f"consistency:   {folder / 'consistency.json'}")
+
+
+def _exact_images(scene: AnalyticScene, renderer: Renderer, rays: Rays) -> Rendering:
+    rgb, opacity, depth = render_exact(scene, rays, renderer.background(rays.directions[:1])[0])
+    return Rendering(rgb=rgb, opacity=opacity, depth=depth)
+
+
+def _finite(value: float | None) -> float | None:
+    """What JSON can hold: the order of what does not change at all is infinite."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _write_tables(config: DictConfig, runs: list[str], rows: list[dict[str, Any]]) -> None:

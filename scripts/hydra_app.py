@@ -1,22 +1,19 @@
 """What the scripts share: Hydra entry points with one-line errors, objects from configs, saved configs."""
 
-import importlib
 import logging
 import os
-import re
 import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
 import sweeps
 import torch
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -25,19 +22,15 @@ from omegaconf.errors import OmegaConfBaseException
 from settings import check_settings
 
 import dnerf
-from dnerf.allocator import keep_freed_memory
-from dnerf.checkpoints import load_weights
-from dnerf.distributed import LostProcess, is_launched
-from dnerf.renderer import Renderer
-from dnerf.scenes import SCENES
-from dnerf.stopping import TrainingStopped
+from dnerf.core.process import prepare_process
+from dnerf.rendering.renderer import Renderer
+from dnerf.training import runs
+from dnerf.training.distributed import LostProcess, is_launched
+from dnerf.training.signals import TrainingStopped
 
 WRONG_INPUT = 2
 USER_ERRORS = (ValueError, OSError, MemoryError, LostProcess, HydraException, OmegaConfBaseException)
 NO_MEMORY = "DefaultCPUAllocator"
-MAX_CONFIG_BYTES = 64 * 1024
-MAX_CONFIG_DEPTH = 40
-
 CONF = str(Path(__file__).resolve().parents[1] / "conf")
 
 
@@ -45,12 +38,11 @@ def run_app(main: Callable[[DictConfig], None], config_name: str) -> None:
     """Run a Hydra application; what the user got wrong ends in one line on standard error and exit code 2.
 
     In a multirun a job that fails leaves the others alone; at the end the exit code is 2 if one has failed. SIGINT
-    and SIGTERM end with 130 and 143. Also sets the C allocator to keep memory between steps. Set DNERF_TRACEBACK=1 to
-    see the whole traceback instead.
+    and SIGTERM end with 130 and 143. Set DNERF_TRACEBACK=1 to see the whole traceback instead.
     """
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     _tell_workers_where_we_are()
-    keep_freed_memory()
+    prepare_process()
     with _one_line_errors():
         hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(_as_job(main, config_name))()
         sweeps.finish()
@@ -135,14 +127,10 @@ def _tell_workers_where_we_are() -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """An error's message on one line, of its cause where Hydra wraps it; what Python says of a call names the place."""
-    place = ""
+    """An error's message on one line, of its cause where Hydra wraps it."""
     while isinstance(error, HydraException) and error.__cause__ is not None:
-        found = re.search(r"full_key: (\S+)", str(error))
-        place = found.group(1) if found else place
         error = error.__cause__
-    line = " ".join(line.strip() for line in str(error).splitlines() if line.strip())
-    return f"{place}: {line}" if place and not isinstance(error, USER_ERRORS) else line
+    return " ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
 def moved(saved: DictConfig, data_root: str | None) -> None:
@@ -158,37 +146,18 @@ def moved(saved: DictConfig, data_root: str | None) -> None:
     saved.data.root = data_root
 
 
-def build(config: DictConfig) -> Any:
-    """Instantiate a config node whose `_target_`s all lie in this package.
+def build(config: DictConfig, *, trusted: bool = False) -> Any:
+    """The objects that a config node describes.
+
+    Args:
+        config: a node of a composed config, or of a run's.
+        trusted: whether it stems from the user's own command line, where any importable class may be named.
 
     Raises:
-        ValueError: naming the target that does not.
+        ValueError: naming the place in the config.
     """
-    _check_targets(OmegaConf.to_container(config, resolve=True))
-    return hydra.utils.instantiate(config, _convert_="all")
-
-
-def _check_targets(node: object) -> None:
-    if isinstance(node, dict):
-        if "_target_" in node:
-            _check_target(str(node["_target_"]))
-        node = list(node.values())
-    if isinstance(node, list):
-        for child in node:
-            _check_targets(child)
-
-
-def _check_target(target: str) -> None:
-    """Allow the classes that this package defines and its scenes' makers; no other function, nothing it imports."""
-    module_name, _, name = target.rpartition(".")
-    found = None
-    if module_name.partition(".")[0] == dnerf.__name__:
-        with suppress(ImportError):
-            found = getattr(importlib.import_module(module_name), name, None)
-    is_class = isinstance(found, type) and found.__module__.startswith(f"{dnerf.__name__}.")
-    is_maker = any(found is make for make in SCENES.values())
-    if not is_class and not is_maker:
-        raise ValueError(f"_target_ must be a class or scene of the package {dnerf.__name__}, got {target!r}")
+    place = config._get_full_key(None)
+    return runs.build(OmegaConf.to_container(config, resolve=True, throw_on_missing=True), place, trusted=trusted)
 
 
 def resolve_device(name: str) -> torch.device:
@@ -219,45 +188,14 @@ def resolve_device(name: str) -> torch.device:
 
 
 def load_config(run: str) -> DictConfig:
-    """The config saved with a run; it is data, never code: no interpolations, targets of this package only.
+    """The config saved with a run, see `dnerf.training.runs.load_config`.
 
     Raises:
         ValueError: naming the file, if it is missing or is not such a config.
     """
-    path = Path(run) / "config.yaml"
-    if not path.is_file():
-        raise ValueError(f"run: {path} does not exist; {run} is not the folder of a run")
-    try:
-        value = _plain_yaml(path)
-        config = OmegaConf.create(value)
-    except Exception as error:
-        raise ValueError(f"{path}: not a readable config ({one_line(error)})") from error
-    groups = [value.get(name) if isinstance(value, dict) else None for name in ("renderer", "data")]
-    if not isinstance(config, DictConfig) or not all(isinstance(group, dict) for group in groups):
-        raise ValueError(f"{path}: expected a mapping with renderer and data, not the config of a run")
-    container = OmegaConf.to_container(config, resolve=False)
-    if "${" in str(container):
-        raise ValueError(f"{path}: expected resolved values, got an interpolation '${{'")
-    try:
-        _check_targets(container)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    config = OmegaConf.create(runs.load_config(run))
+    assert isinstance(config, DictConfig)
     return config
-
-
-def _plain_yaml(path: Path) -> Any:
-    """The value of a small YAML file, neither deep nor with references, which could unfold without bound."""
-    with path.open("rb") as file:
-        data = file.read(MAX_CONFIG_BYTES + 1)
-    if len(data) > MAX_CONFIG_BYTES:
-        raise ValueError(f"more than {MAX_CONFIG_BYTES} bytes")
-    text, depth = data.decode(), 0
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    for event in yaml.parse(text, loader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_CONFIG_DEPTH or isinstance(event, yaml.AliasEvent):
-            raise ValueError(f"aliases and more than {MAX_CONFIG_DEPTH} levels are not supported")
-    return yaml.load(text, loader)
 
 
 def load_renderer(run: str, config: DictConfig, device: torch.device) -> Renderer:
@@ -266,10 +204,5 @@ def load_renderer(run: str, config: DictConfig, device: torch.device) -> Rendere
     Raises:
         ValueError: if the config builds no renderer or the checkpoint is missing, damaged or does not fit.
     """
-    renderer = build(config.renderer)
-    if not isinstance(renderer, Renderer):
-        raise ValueError(
-            f"{run}/config.yaml: renderer must be a dnerf.renderer.Renderer, got {type(renderer).__name__}"
-        )
-    load_weights(renderer, Path(run) / "model.safetensors")
-    return renderer.to(device).eval()
+    plain: Any = OmegaConf.to_container(config)
+    return runs.load_renderer(run, plain, device)

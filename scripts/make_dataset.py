@@ -15,7 +15,7 @@ def main(config: DictConfig) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ValueError(f"out: {out} exists and is not an empty folder")
     source = SyntheticData(
-        build(config.scene),
+        build(config.scene, trusted=True),
         config.resolution,
         num_train=config.num_frames,
         num_val=config.num_val,

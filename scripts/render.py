@@ -1,8 +1,9 @@
-"""Render a sequence of a run: python scripts/render.py run=runs/mutant path=orbit num_frames=60 format=mp4"""
+"""Render a film of a run: python scripts/render.py run=runs/mutant path=orbit num_frames=60 format=mp4"""
 
 import hashlib
 import math
 import os
+import sys
 from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
@@ -11,31 +12,39 @@ import torch
 import torch.distributed
 from hydra_app import build, load_config, load_renderer, moved, resolve_device, run_app
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from reporting import camera_split
 from torch import Tensor
 from tqdm import tqdm
 
-from dnerf.cameras import Intrinsics, fixed_path, look_at, orbit_path, spiral_path
-from dnerf.checks import check_choice
+from dnerf.core.cameras import Intrinsics
+from dnerf.core.checks import check_choice
 from dnerf.data import DataSource, Frames, SyntheticData, render_exact
-from dnerf.renderer import Renderer
+from dnerf.motion import motion_model
+from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import OccupancySampler
-from dnerf.sequences import (
+from dnerf.visualization import (
     FILM_FORMATS,
     FrameStore,
     Share,
     View,
+    box_planes,
     check_outputs,
+    fixed_path,
+    is_empty,
     make_views,
+    orbit_path,
     pingpong_times,
+    pose_around,
     read_key_frames,
     render_frames_to,
     sequence_digest,
     slow_motion_times,
+    spiral_path,
     sweep_times,
     write_films,
     write_plan,
 )
-from dnerf.video import check_fps
+from dnerf.visualization.video import check_fps
 
 TIME_PATHS = ("sweep", "pingpong", "slow")
 
@@ -52,14 +61,14 @@ def main(config: DictConfig) -> None:
     share = Share(int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
     device = resolve_device(config.device)
     renderer = load_renderer(config.run, saved, device)
-    _split(renderer, config.splits)
+    _subdivide(renderer, config.subdivision)
     data = build(saved.data)
-    frames = data.frames(config.path.get("split", "test"))
-    views = _views(config, frames, device)
+    frames = data.frames(camera_split(config.path.split, data))
+    views = _views(config, frames, data.box, device)
     chunk = config.chunk or saved.chunk
     facts = {
         "model": _fingerprint(config.run), "outputs": outputs, "chunk": chunk, "device": device.type,
-        "exact": config.exact, "splits": config.splits,
+        "subdivision": config.subdivision,
     }  # fmt: skip
     path = _output(config, formats)
     store = FrameStore(path.parent / f".{path.name}.{sequence_digest(views, facts)}", len(views))
@@ -74,26 +83,41 @@ def main(config: DictConfig) -> None:
         print(f"{kept} of {len(views)} frames are there already")
     with tqdm(total=len(missing), unit="frame", disable=share.rank > 0, dynamic_ncols=True) as bar:
         render_frames_to(
-            store, renderer, views, outputs,
-            truth=truth, chunk=chunk, share=share, exact=config.exact, on_frame=lambda _: bar.update(),
-        )  # fmt: skip
+            store, renderer, views, outputs, truth=truth, chunk=chunk, share=share, on_frame=lambda _: bar.update()
+        )
     if share.size > 1:
         torch.distributed.barrier()
         torch.distributed.destroy_process_group()
     if share.rank == 0:
         for written in write_films(store, path, outputs, formats, fps=config.fps, views=views):
             print(f"{len(views)} frames: {written}")
+        _warn(config.path, renderer, store, outputs, data.box)
         if not config.keep_frames:
             store.remove()
 
 
-def _split(renderer: Renderer, splits: int | None) -> None:
-    """Have pictures cut the steps in which something is seen into so many; None for as many as the run says."""
-    if splits is None:
+def _warn(path: DictConfig, renderer: Renderer, store: FrameStore, outputs: list[str], box: Tensor | None) -> None:
+    """Say on standard error what a film does not show."""
+    if is_empty(store):
+        placed = [f"path.{name}={path[name]}" for name in ("radius", "target", "file") if name in path]
+        where = f" ({', '.join(placed)})" if placed else ""
+        print(
+            f"warning: the film is empty: nothing is visible in any frame. Does the camera look at the box "
+            f"{None if box is None else box.tolist()}? See path.radius and path.target{where}",
+            file=sys.stderr,
+        )
+    if "motion" in outputs and motion_model(renderer) is None:
+        print("warning: the motion of this model is unknown, its film is grey: it has no deformation", file=sys.stderr)
+
+
+def _subdivide(renderer: Renderer, subdivision: int | None) -> None:
+    """Cut the visible steps of images into so many parts; None for as many as the run says."""
+    if subdivision is None:
         return
     if not isinstance(renderer.sampler, OccupancySampler):
-        raise ValueError(f"splits must be null for a run with a {type(renderer.sampler).__name__}, got {splits}")
-    renderer.sampler.render_splits = splits
+        name = type(renderer.sampler).__name__
+        raise ValueError(f"subdivision must be null for a run with a {name}, got {subdivision}")
+    renderer.sampler.render_subdivision = subdivision
 
 
 def _listed(value: str | ListConfig) -> list[str]:
@@ -111,7 +135,7 @@ def _fingerprint(run: str) -> str:
     return digest.hexdigest()
 
 
-def _views(config: DictConfig, frames: Frames, device: torch.device) -> list[View]:
+def _views(config: DictConfig, frames: Frames, box: Tensor | None, device: torch.device) -> list[View]:
     intrinsics = _resized(frames.intrinsics, config.resolution)
     angles: list[float | None] | None = None
     own_times: list[float] | None = None
@@ -127,10 +151,10 @@ def _views(config: DictConfig, frames: Frames, device: torch.device) -> list[Vie
     else:
         poses = _poses(config, frames)
     times = own_times if config.time is None and own_times is not None else _times(config, len(poses))
-    have_truth = config.path.name == "test" and times is own_times
-    return make_views(
-        poses.to(device), times, intrinsics, frames.near, frames.far, angles=angles, have_truth=have_truth
-    )
+    are_frames = config.path.name == "test"
+    planes = [(frames.near, frames.far)] * len(poses) if are_frames or box is None else box_planes(poses, box)
+    have_truth = are_frames and times is own_times
+    return make_views(poses.to(device), times, intrinsics, planes, angles=angles, have_truth=have_truth)
 
 
 def _resized(intrinsics: Intrinsics, resolution: int | ListConfig | None) -> Intrinsics:
@@ -163,10 +187,8 @@ def _fixed_pose(path: DictConfig, frames: Frames) -> Tensor:
         if not 0 <= path.frame < len(frames):
             raise ValueError(f"path.frame must be in 0..{len(frames) - 1}, got {path.frame}")
         return frames.poses[path.frame]
-    azimuth, elevation = math.radians(path.azimuth), math.radians(path.elevation)
-    around = math.cos(elevation)
-    offset = (around * math.cos(azimuth), around * math.sin(azimuth), math.sin(elevation))
-    return look_at([t + path.radius * o for t, o in zip(path.target, offset)], list(path.target))
+    angles = {name: math.radians(path[name]) for name in ("azimuth", "elevation")}
+    return pose_around(list(path.target), radius=path.radius, **angles)
 
 
 def _times(config: DictConfig, count: int) -> list[float]:
@@ -187,7 +209,7 @@ def _times(config: DictConfig, count: int) -> list[float]:
 def _truth(
     data: DataSource, frames: Frames, renderer: Renderer, views: Sequence[View], *, same_size: bool
 ) -> Callable[[View], Tensor]:
-    """What gives the true picture of each view: the data's own picture, or the exact scene."""
+    """What gives the true image of each view: the data's own image, or the exact scene."""
     background = renderer.background(torch.zeros(1, 3, device=renderer.device))[0]
     if isinstance(data, SyntheticData):
         scene = data.scene.to(renderer.device)
@@ -200,14 +222,14 @@ def _truth(
 
     if not same_size or any(view.truth_index is None for view in views):
         raise ValueError(
-            "outputs: compare needs true pictures: path=test at the data's own resolution, or an exact scene"
+            "outputs: compare needs true images: path=test at the data's own resolution, or an exact scene"
         )
 
-    def picture(view: View) -> Tensor:
+    def image(view: View) -> Tensor:
         assert view.truth_index is not None
         return frames.image(view.truth_index, background.cpu())
 
-    return picture
+    return image
 
 
 if __name__ == "__main__":

@@ -7,9 +7,9 @@ from typing import Any
 from hydra_app import load_config, run_app
 from omegaconf import DictConfig
 
-from dnerf.files import write_text
-from dnerf.report import read_scores, write_report_text
-from dnerf.sequences import OUTPUTS
+from dnerf.core.files import write_text
+from dnerf.evaluation.report import read_scores, write_report_text
+from dnerf.visualization import OUTPUTS
 
 SHEETS = (
     ("contact_sheet", "Contact sheet", "Frames spread evenly over the split: prediction, truth, absolute error."),

@@ -7,14 +7,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dnerf.backgrounds import COLORS
+from dnerf.core.backgrounds import COLORS
+from dnerf.core.files import write_json
 from dnerf.data import DataSource
 from dnerf.evaluation import FrameScore, evaluate, scores_by_time, spread_indices
-from dnerf.files import write_json
-from dnerf.logs import SHEET_COLUMNS
-from dnerf.provenance import provenance
-from dnerf.renderer import Renderer
-from dnerf.video import contact_sheet, error_map, write_png
+from dnerf.evaluation.provenance import provenance
+from dnerf.rendering.renderer import Renderer
+from dnerf.visualization import comparison_sheet, write_png
 
 MAX_ROWS = 4
 
@@ -50,13 +49,13 @@ def evaluate_run(
     training = read_training(folder)
     frames = data.frames(split)
     scored = spread_indices(len(frames), max_frames)
-    shown = {scored[k] for k in spread_indices(len(scored), MAX_ROWS)}
-    rows: list[list[Tensor]] = []
+    chosen = {scored[k] for k in spread_indices(len(scored), MAX_ROWS)}
+    pairs: list[tuple[Tensor, Tensor]] = []
     labels: list[str] = []
 
     def keep(score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
-        if score.index in shown:
-            rows.append([prediction, truth, error_map(prediction, truth)])
+        if score.index in chosen:
+            pairs.append((prediction, truth))
             labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")
 
     evaluation = evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep, lpips=lpips)
@@ -71,9 +70,21 @@ def evaluate_run(
     }
     if data.train_end is not None:
         metrics |= {"train_end": data.train_end, **scores_by_time(evaluation.frames, data.train_end)}
-    write_png(contact_sheet(rows, columns=SHEET_COLUMNS, rows=labels), sheet_path(folder, split))
+    write_png(comparison_sheet(pairs, labels), sheet_path(folder, split))
     write_json(folder / name, metrics)
     return metrics
+
+
+def camera_split(split: str | None, data: DataSource) -> str:
+    """The split whose cameras are taken where frames do not matter: the one named, else test, else train."""
+    if split is not None:
+        return split
+    try:
+        data.check("test")
+    except ValueError as error:
+        print(f"the camera is that of the train split: {error}")
+        return "train"
+    return "test"
 
 
 def _color_name(renderer: Renderer) -> str:

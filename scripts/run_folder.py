@@ -1,6 +1,6 @@
 """The folder of a run: a new one, or the one whose training is continued."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -13,8 +13,8 @@ from hydra.types import RunMode
 from hydra_app import load_config, moved
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from dnerf.files import TEMPORARY, claimed, remove_leftovers, write_json, write_text
-from dnerf.run_state import CheckpointFolder
+from dnerf.core.files import TEMPORARY, claimed, remove_leftovers, write_json, write_text
+from dnerf.training.checkpoint_folder import CHECKPOINTS, CheckpointFolder
 
 # What may be another when a run is continued: how long, where and how it is watched, not what is trained.
 CHANGEABLE = (
@@ -26,16 +26,15 @@ CHANGEABLE = (
     "evaluate_split",
     "evaluate_frames",
     "chunk",
-    "tensorboard",
-    "preview_every",
+    "data.root",
     "trainer.num_steps",
     "trainer.max_seconds",
     "trainer.log_every",
-    "trainer.checkpoint_every",
-    "trainer.progress_bar",
-    "data.root",
+    *(f"trainer.callbacks.{name}" for name in ("checkpoints", "log", "tensorboard", "previews", "progress_bar")),
+    "trainer.callbacks.box_warning",
 )
-OWN_FOLDERS = ("checkpoints", "previews")
+OWN_FOLDERS = (CHECKPOINTS, "previews")
+FITTED = "auto"  # data.box
 
 
 def continued(config: DictConfig) -> DictConfig:
@@ -56,55 +55,39 @@ def continued(config: DictConfig) -> DictConfig:
     hydra = HydraConfig.get()
     overrides = OverridesParser.create().parse_overrides(list(hydra.overrides.task))
     given = {override.get_key_element().lstrip("+~").partition("@")[0] for override in overrides}
-    if _is_free(folder) and given - set(CHANGEABLE):  # it was refused, or stopped, before its first record
+    # It was refused, or stopped, before its first record.
+    if _is_free(folder) and not all(map(_may_change, given)):
         return config
     moved(saved, config.data_root)
-    values = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
-    assert isinstance(values, DictConfig)
-    fit = saved.get("box_fit")
-    if fit is not None and values.data.box == fit.given:  # the run has found that less is enough
-        values = in_box(values, saved.data.box, fit.seconds)
+    values = config.copy()
+    if values.data.get("box") == FITTED:  # the run knows which box that is
+        values.data.box = saved.data.get("box", FITTED)
+    values = resolved(values)
     if given & set(hydra.runtime.choices):  # an experiment or another group was named: all of it must agree
         moved(values, config.data_root)
         _check_same(_leaves(saved), _leaves(values), folder)
         return values
     before, now = ({key: OmegaConf.select(node, key) for key in given} for node in (saved, values))
     _check_same(before, now, folder)
-    for key in given & set(CHANGEABLE):
+    for key in filter(_may_change, given):
         OmegaConf.update(saved, key, OmegaConf.select(values, key), force_add=True)
     return saved
 
 
-def in_box(config: DictConfig, box: Sequence[Sequence[float]], seconds: float) -> DictConfig:
-    """A run's config with another `data.box`, also wherever else a `box` is that one.
-
-    Args:
-        config: of the run.
-        box: (2, 3) corners, in world units.
-        seconds: of training that were spent to find it.
-
-    Returns:
-        A config without interpolations, whose `box_fit` says what box was given and the seconds.
-    """
-    values = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(values, dict)
-    before = values["data"]["box"]
-    corners = [[float(value) for value in corner] for corner in box]
-    given = (values.get("box_fit") or {"given": before})["given"]
-    changed = OmegaConf.create({**_with_box(values, before, corners), "box_fit": {"given": given, "seconds": seconds}})
-    assert isinstance(changed, DictConfig)
-    return changed
+def resolved(config: DictConfig) -> DictConfig:
+    """A config without interpolations."""
+    values = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    assert isinstance(values, DictConfig)
+    return values
 
 
-def _with_box(node: Any, before: object, after: object) -> Any:
-    if isinstance(node, dict):
-        return {k: after if k == "box" and v == before else _with_box(v, before, after) for k, v in node.items()}
-    return [_with_box(value, before, after) for value in node] if isinstance(node, list) else node
+def _may_change(key: str) -> bool:
+    return any(key == name or key.startswith(f"{name}.") for name in CHANGEABLE)
 
 
 def _check_same(before: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
     for key in sorted(before.keys() | now.keys()):
-        if key not in CHANGEABLE and before.get(key) != now.get(key):
+        if not _may_change(key) and before.get(key) != now.get(key):
             raise ValueError(
                 f"resume: {key} must be {before.get(key)} as when {folder} began, got {now.get(key)}; "
                 "choose another out_dir for another run"
@@ -153,7 +136,7 @@ def opened(config: DictConfig) -> Iterator[Path]:
     for path in folder.iterdir():
         if path.is_symlink():  # a folder that somebody else made could have us write anywhere
             raise ValueError(f"out_dir: {path} is a link; a run's folder holds files and folders of its own")
-    if (folder / "model.safetensors").exists() and not CheckpointFolder(folder / "checkpoints").is_begun:
+    if (folder / "model.safetensors").exists() and not CheckpointFolder(folder / CHECKPOINTS).is_begun:
         raise ValueError(f"resume: {folder} holds a model but no checkpoint to continue from; choose a new out_dir")
     with claimed(folder):
         for path in (folder, *(folder / name for name in OWN_FOLDERS)):

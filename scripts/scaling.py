@@ -9,7 +9,9 @@ import tempfile
 from pathlib import Path
 
 TRAIN = Path(__file__).with_name("train.py")
-SETTINGS = ("trainer.max_seconds=null", "trainer.log_every=1", "trainer.progress_bar=false", "evaluate_split=null")
+SETTINGS = (
+    "trainer.max_seconds=null", "trainer.log_every=1", "trainer.callbacks.progress_bar=null", "evaluate_split=null"
+)  # fmt: skip
 
 
 def measure(processes: int, steps: int, threads: int, overrides: list[str]) -> tuple[float, float, float]:

@@ -66,30 +66,30 @@ EVERYWHERE: Mapping[str, Kind] = {
 }  # fmt: skip
 KINDS: Mapping[str, Mapping[str, Kind]] = {
     "train": {
-        "out_dir": TEXT.or_null(), "resume": TRUTH, "tensorboard": TRUTH, "evaluate_split": SPLIT,
-        "evaluate_frames": POSITIVE.or_null(), "chunk": POSITIVE, "preview_every": COUNT, "process_timeout": NUMBER,
-        "trainer.progress_bar": TRUTH,
+        "out_dir": TEXT.or_null(), "resume": TRUTH, "evaluate_split": SPLIT, "evaluate_frames": POSITIVE.or_null(),
+        "chunk": POSITIVE, "process_timeout": NUMBER,
     },
     "evaluate": {
         "run": TEXT.or_null(), "runs": TEXTS, "protocol": TEXT.or_null(), "split": SPLIT, "label": TEXT.or_null(),
         "lego_split": _one_of("test", "val").or_null(), "table": TEXT.or_null(), "max_frames": POSITIVE.or_null(),
-        "worst": COUNT, "plots": TRUTH, "lpips.enabled": TRUTH, "lpips.download": TRUTH, "temporal.enabled": TRUTH,
-        "temporal.num_frames": _whole(2), "temporal.resolution": POSITIVE, "chunk": POSITIVE.or_null(),
+        "worst": COUNT, "plots": TRUTH, "consistency": TRUTH, "lpips.enabled": TRUTH, "lpips.download": TRUTH,
+        "temporal.enabled": TRUTH, "temporal.num_frames": _whole(3), "temporal.resolution": POSITIVE,
+        "chunk": POSITIVE.or_null(),
     },
     "render": {
-        "format": SEVERAL, "outputs": SEVERAL, "exact": TRUTH, "keep_frames": TRUTH, "chunk": POSITIVE.or_null(),
+        "format": SEVERAL, "outputs": SEVERAL, "keep_frames": TRUTH, "chunk": POSITIVE.or_null(),
         "resolution": _either(
             "a width or [width,height] in pixels, or null", POSITIVE.or_null(), _listed(POSITIVE, "", 2)
         ),
         "time": _either("sweep, pingpong, slow, a number in [0, 1] or null", TEXT, NUMBER.or_null()),
-        "time_range": _listed(NUMBER, "two times", 2), "splits": POSITIVE.or_null(),
+        "time_range": _listed(NUMBER, "two times", 2), "subdivision": POSITIVE.or_null(),
         "slow_motion.center": NUMBER, "slow_motion.width": NUMBER, "slow_motion.factor": NUMBER,
         "path.split": SPLIT, "path.frame": COUNT.or_null(), "path.radius": NUMBER, "path.elevation": NUMBER,
         "path.azimuth": NUMBER, "path.turns": NUMBER, "path.start_angle": NUMBER, "path.target": PLACE,
         "path.elevations": _listed(NUMBER, "two angles", 2), "path.file": TEXT,
     },
     "tracks": {
-        "split": SPLIT, "frame": COUNT, "start": NUMBER, "spacing": POSITIVE, "every": POSITIVE, "matter_rays": COUNT,
+        "split": SPLIT, "frame": COUNT, "start": NUMBER, "spacing": POSITIVE, "every": POSITIVE,
         "trail": COUNT, "format": TEXT, "resolution": POSITIVE.or_null(), "chunk": POSITIVE.or_null(),
     },
     "make_dataset": {"out": TEXT, "num_val": POSITIVE, "num_test": POSITIVE, "resolution": POSITIVE},

@@ -21,7 +21,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from dnerf.files import write_text
+from dnerf.core.files import write_text
 
 ERRORS = "errors"
 NAME_LENGTH = 120
@@ -39,7 +39,7 @@ class SweepWatch(Callback):
         SweepWatch.folder = Path(config.hydra.sweep.dir)
         shutil.rmtree(SweepWatch.folder / ERRORS, ignore_errors=True)
         overrides = OverridesParser.create().parse_overrides(list(config.hydra.overrides.task))
-        fixed = sorted({o.get_key_element() for o in overrides if not o.is_sweep_override()} | NOT_NAMED)
+        fixed = sorted({o.key_or_group for o in overrides if not o.is_sweep_override()} | NOT_NAMED)
         with open_dict(config):
             config.hydra.overrides.hydra.append(
                 f"hydra.job.config.override_dirname.exclude_keys=[{','.join(map(_quoted, fixed))}]"

@@ -1,11 +1,8 @@
-"""Train with several forked processes and with one, and say how far the results are apart, as JSON.
-
-    python tests/data_parallel.py [--processes 2] [--steps 20]
+"""Train with two forked processes and with one, and say how far the results are apart, as JSON; then disturb the two.
 
 Started by the tests in a process of its own, since processes that have begun threads must not fork.
 """
 
-import argparse
 import json
 import os
 import signal
@@ -20,27 +17,22 @@ from typing import Any
 
 import torch
 from preload import load_everything
-from test_body_search import a_renderer, frames_of_two_balls, wrong_where_matter_is
+from small_runs import BOX, Watch
 from torch import Tensor
 
-from dnerf.backgrounds import RandomBackground
-from dnerf.body_search import BodySearch
-from dnerf.compositing import Rendering
-from dnerf.data import Frames, SyntheticData
+from dnerf.core.backgrounds import RandomBackground
+from dnerf.core.compositing import Rendering
+from dnerf.data import SyntheticData
+from dnerf.data.pixel_samplers import ErrorGuidedPixels, TemporalCurriculum
 from dnerf.deformations import DisplacementDeformation
-from dnerf.distributed import LostProcess, Processes, started
-from dnerf.error_map import ErrorMap
-from dnerf.fields import DeformedField, GridField, NeRFField, SpaceTimeVolumes
-from dnerf.losses import Loss, PhotometricLoss
-from dnerf.missing_matter import MissingMatterCheck
-from dnerf.renderer import Renderer
-from dnerf.run_state import CheckpointFolder
-from dnerf.samplers import ImportanceSampler, OccupancySampler
+from dnerf.fields import DeformedField, GridField, NeRFField
+from dnerf.losses import Batch, Loss, PhotometricLoss
+from dnerf.rendering import Renderer
+from dnerf.samplers import ImportanceSampler, OccupancyGrid, OccupancySampler
 from dnerf.scenes import make_scene
-from dnerf.stopping import TrainingStopped
-from dnerf.training import Trainer
+from dnerf.training import Checkpoints, Trainer, TrainingStopped
+from dnerf.training.distributed import LostProcess, Processes, started
 
-BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
 CPU = torch.device("cpu")
 
 
@@ -54,66 +46,47 @@ def mlp() -> tuple[Renderer, dict[str, Any]]:
 
 
 def grid() -> tuple[Renderer, dict[str, Any]]:
-    """The fast path: rays adapted to samples; occupancy, errors and missing matter, known from what each sees."""
-    volumes = SpaceTimeVolumes(BOX, (4,), (4,), waits=True)
-    canonical = GridField(BOX, (8, 16, 32), 4, hidden_features=16, space_time=volumes, density_shift=-4.0)
-    sampler = OccupancySampler(BOX, 0.1, 24, num_slabs=4, update_every=4, num_probes=512, pad_to=1)
-    return Renderer(DeformedField(deformation(), canonical), sampler, RandomBackground()), {
-        "num_rays": 64, "target_samples": 1500, "error_map": ErrorMap(resolution=8),
-        "missing_matter": MissingMatterCheck(0.01, begin=0.4, every=2, min_steps=0),
-    }  # fmt: skip
+    """The fast path: rays adapted to samples; occupancy and errors known from what each process sees."""
+    canonical = GridField(BOX, (8, 16, 32), 4, hidden_features=16, density_shift=-4.0)
+    cells = OccupancyGrid(BOX, 24, num_slabs=4, update_every=4, num_probes=512)
+    renderer = Renderer(
+        DeformedField(deformation(), canonical), OccupancySampler(cells, 0.1, pad_to=1), RandomBackground()
+    )
+    pixels = ErrorGuidedPixels(TemporalCurriculum(), resolution=8)
+    return renderer, {"num_rays": 64, "target_samples": 1500, "pixels": pixels}
 
 
-class SeenAtOnce(BodySearch):
-    """Searches as if training had shown where pictures are wrong."""
-
-    def __call__(self, step: int, renderer: Renderer, frames: Frames, error_map: ErrorMap) -> bool:
-        return super().__call__(step, renderer, frames, wrong_where_matter_is(frames))
-
-
-def bodies() -> tuple[Renderer, dict[str, Any]]:
-    """A fast ball is found, carried and learnt."""
-    return a_renderer(), {
-        "frames": frames_of_two_balls(), "num_rays": 64, "target_samples": 1500, "error_map": ErrorMap(resolution=24),
-        "body_search": SeenAtOnce(BOX, 0.3, min_steps=2),
-    }  # fmt: skip
-
-
-MODELS = {"mlp": mlp, "grid": grid, "bodies": bodies}
+MODELS = {"mlp": mlp, "grid": grid}
 
 
 class Mishap(Loss):
-    """No loss, but a signal that this process sends to itself at a step, if it has that rank."""
+    """No loss, but a signal that the second process sends to itself at step 3."""
 
-    def __init__(self, number: int, rank: int, step: int = 3) -> None:
+    def __init__(self, number: int) -> None:
         super().__init__()
-        self.number, self.rank, self.steps_left = number, rank, step
+        self.number, self.steps_left = number, 3
 
-    def forward(self, rendering: Rendering, target: Tensor, renderer: Renderer) -> Tensor:
+    def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
         self.steps_left -= 1
-        if self.steps_left == 0 and os.environ["RANK"] == str(self.rank):
+        if self.steps_left == 0 and os.environ["RANK"] == "1":
             os.kill(os.getpid(), self.number)
         return rendering.rgb.sum() * 0
 
 
-def train(model: str, steps: int, processes: Processes, folder: Path, **changes: Any) -> dict[str, Any]:
+def train(model: str, steps: int, processes: Processes, folder: Path, every: int = 7, **changes: Any) -> dict[str, Any]:
     """The first and final state of a training, and what its log says."""
     torch.manual_seed(0)
     renderer, settings = MODELS[model]()
     before = {name: value.clone() for name, value in renderer.state_dict().items()}
-    frames = settings.pop("frames", None) or SyntheticData(make_scene("walker"), 16, num_train=6).frames("train")
-    records: list[dict[str, Any]] = []
-    settings |= {"log_every": 1, "checkpoint_every": 7, "progress_bar": False, **changes}
-    Trainer(num_steps=steps, **settings).fit(
-        renderer,
-        frames,
-        seed=5,
-        callbacks=[lambda record, _: records.append({**vars(record), "seconds": 0})],
-        checkpoints=CheckpointFolder(folder),
-        processes=processes,
-    )
+    frames = SyntheticData(make_scene("walker"), 16, num_train=6).frames("train")
+    records = Watch()
+    callbacks = {"records": records, "checkpoints": Checkpoints(every)}
+    trainer = Trainer(num_steps=steps, log_every=1, callbacks=callbacks, **(settings | changes))
+    trainer.fit(renderer, frames, seed=5, folder=folder, processes=processes)
     processes.merge_observations(renderer)
-    return {"before": before, "state": dict(renderer.state_dict()), "records": records}
+    pixels = {f"pixels.{name}": value for name, value in trainer.pixels.state_dict().items()}
+    kept = [{**vars(record), "seconds": 0} for record in records.records]  # the clock aside
+    return {"before": before, "state": {**renderer.state_dict(), **pixels}, "records": kept}
 
 
 def forked(work: Callable[[int], Any], count: int) -> tuple[list[int], list[Any]]:
@@ -126,13 +99,10 @@ def forked(work: Callable[[int], Any], count: int) -> tuple[list[int], list[Any]
         port = free.getsockname()[1]
     with tempfile.TemporaryDirectory() as folder:
         pids = [os.fork() or _child(work, rank, count, port, folder) for rank in range(count)]
-        codes = [0] * count
-        for rank in range(count):
-            _, status = os.waitpid(pids[rank], os.WUNTRACED)
-            if os.WIFSTOPPED(status):
-                codes[rank] = os.WSTOPSIG(status)
-            else:
-                codes[rank] = os.waitstatus_to_exitcode(status)
+        codes = []
+        for pid in pids:
+            _, status = os.waitpid(pid, os.WUNTRACED)
+            codes.append(os.WSTOPSIG(status) if os.WIFSTOPPED(status) else os.waitstatus_to_exitcode(status))
         for pid, code in zip(pids, codes):
             if code == signal.SIGSTOP:
                 os.kill(pid, signal.SIGKILL)
@@ -160,28 +130,26 @@ def _child(work: Callable[[int], Any], rank: int, count: int, port: int, folder:
         os._exit(code)
 
 
-def compare(model: str, steps: int, count: int) -> dict[str, Any]:
-    """Largest differences between `count` processes and one, and among the processes."""
+def compare(model: str) -> dict[str, Any]:
+    """Largest differences between two processes and one, and among the two."""
     with tempfile.TemporaryDirectory() as place:
 
         def together(rank: int) -> dict[str, Any]:
             with started(CPU, 60) as processes:
-                return train(model, steps, processes, Path(place) / f"{rank}")
+                return train(model, 20, processes, Path(place) / f"{rank}")
 
-        _, (alone,) = forked(lambda rank: train(model, steps, Processes(), Path(place) / "alone"), 1)
-        _, several = forked(together, count)
-        written = [len(list(Path(place).glob(f"{rank}/*"))) for rank in range(count)]
-    before, one, first = alone["before"], alone["state"], several[0]["state"]
-    floats = [name for name, value in one.items() if value.is_floating_point()]
-    records = list(zip(alone["records"], several[0]["records"], strict=True))
+        _, (alone,) = forked(lambda rank: train(model, 20, Processes(), Path(place) / "alone"), 1)
+        _, (two, other) = forked(together, 2)
+        written = [len(list(Path(place).glob(f"{rank}/checkpoints/*"))) for rank in range(2)]
+    before, one, first = alone["before"], alone["state"], two["state"]
+    floats = {name for name, value in one.items() if value.is_floating_point()}
+    records = list(zip(alone["records"], two["records"], strict=True))
     return {
         "difference": max(float((one[name] - first[name]).abs().max()) for name in floats),
-        "moved": max(float((one[name] - before[name]).abs().max()) for name in floats),
-        "occupancy_equal": all(torch.equal(one[name], first[name]) for name in one.keys() - set(floats)),
+        "moved": max(float((one[name] - before[name]).abs().max()) for name in before.keys() & floats),
+        "occupancy_equal": all(torch.equal(one[name], first[name]) for name in one.keys() - floats),
         "occupied": [float(value.float().mean()) for name, value in one.items() if name.endswith("occupied")],
-        "processes_equal": all(torch.equal(first[name], o["state"][name]) for o in several[1:] for name in first),
-        "joined": [bool(value) for name, value in one.items() if name.endswith("joined")],
-        "bodies": [int((value > 0).sum()) for name, value in one.items() if name.endswith("bodies.radii")],
+        "processes_equal": all(torch.equal(value, other["state"][name]) for name, value in first.items()),
         "num_rays_equal": all(a["num_rays"] == b["num_rays"] for a, b in records),
         "num_rays_vary": len({a["num_rays"] for a, _ in records}) > 1,
         "loss_difference": max(abs(a["losses"]["loss"] - b["losses"]["loss"]) for a, b in records),
@@ -189,39 +157,28 @@ def compare(model: str, steps: int, count: int) -> dict[str, Any]:
     }
 
 
-def mishap(number: int, rank: int, timeout: float) -> dict[str, Any]:
-    """What becomes of two processes when one gets a signal at step 3."""
+def mishap(number: int, timeout: float) -> dict[str, Any]:
+    """What becomes of two processes when the second gets a signal at step 3."""
     with tempfile.TemporaryDirectory() as place:
 
-        def together(own_rank: int) -> None:
+        def together(rank: int) -> None:
             with started(CPU, timeout) as processes:
-                losses = {"rgb": PhotometricLoss(), "mishap": Mishap(number, rank)}
-                train("mlp", 10**6, processes, Path(place), losses=losses, checkpoint_every=2)
+                losses = {"rgb": PhotometricLoss(), "mishap": Mishap(number)}
+                train("mlp", 10**6, processes, Path(place), every=2, losses=losses)
 
         begin = time.perf_counter()
         codes, said = forked(together, 2)
-        return {
-            "codes": codes,
-            "said": said,
-            "seconds": time.perf_counter() - begin,
-            "files": sorted(path.name for path in Path(place).iterdir()),
-        }
+        names = sorted(path.name for path in Path(place).glob("checkpoints/*"))
+        return {"codes": codes, "said": said, "seconds": time.perf_counter() - begin, "files": names}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--steps", type=int, default=20)
-    parser.add_argument("--mishaps", action="store_true", help="kill, hang and stop a process as well")
-    given = parser.parse_args()
     torch.set_num_threads(1)  # comparing large tensors begins threads otherwise, and forks of such a process hang
     load_everything()
-    result: dict[str, Any] = {model: compare(model, given.steps, given.processes) for model in MODELS}
-    if given.mishaps:
-        result["killed"] = mishap(signal.SIGKILL, 1, 60)
-        result["hanging"] = mishap(signal.SIGSTOP, 1, 8)
-        result["told to stop"] = mishap(signal.SIGTERM, 1, 60)
-    sys.stdout.write(json.dumps(result, indent=1) + "\n")
+    result = {model: compare(model) for model in MODELS}
+    for case, number, timeout in (("killed", "KILL", 60), ("hanging", "STOP", 8), ("told to stop", "TERM", 60)):
+        result[case] = mishap(signal.Signals[f"SIG{number}"], timeout)
+    sys.stdout.write(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Mutated inputs for everything that reads files of others: data sets, checkpoints, configs of runs.
 
-    python tests/fuzz_readers.py --inputs 100000 [--seed 0] [--reader checkpoint]
+    python tests/fuzz_readers.py --inputs 100000 [--seed 0]
 
 A reader may return or raise ValueError in one line; anything else is a failure, as are more than 5 s of processor time
 for one input or more than 1 GiB of memory beyond that of a process which has loaded everything. The tests run fewer, by
@@ -28,15 +28,18 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "scripts")]
 
-import hydra_app  # noqa: E402
-from test_run_state import limit, small_renderer, state_of  # noqa: E402
+from small_runs import run_of, small_renderer  # noqa: E402
 
-from dnerf.checkpoints import decode, encode, load_weights, save_weights  # noqa: E402
 from dnerf.data import load_blender  # noqa: E402
-from dnerf.run_state import CheckpointFolder  # noqa: E402
+from dnerf.training.checkpoint import encode_run, max_bytes, restore_run  # noqa: E402
+from dnerf.training.checkpoint_folder import CheckpointFolder  # noqa: E402
+from dnerf.training.runs import load_config  # noqa: E402
+from dnerf.training.tensor_files import decode, encode, load_weights, save_weights  # noqa: E402
 
 MAX_SECONDS = 5.0
 MAX_MEMORY = 2**30
+Reader = Callable[[random.Random], None]  # writes mutated files and reads them
+KEYS = ["w", "h", "fl_x", "cx", "k1", "near", "far", "background", "pixel_origin", "x"]
 
 WEIRD_VALUES: list[Any] = [
     None, True, False, 0, -1, 1, 2, 3.5, 1e-320, 1e308, -1e308, math.nan, math.inf, -math.inf, 2**31, 2**63, -(2**64),
@@ -62,7 +65,7 @@ def mutate_bytes(data: bytes, chance: random.Random) -> bytes:
         if kind == 0 and length:
             result[place] ^= 1 << chance.randrange(8)
         elif kind == 1:
-            result[place : place + length] = bytes(chance.randrange(256) for _ in range(length))
+            result[place : place + length] = chance.randbytes(length)
         elif kind == 2:
             del result[place : place + length]
         elif kind == 3:
@@ -76,22 +79,20 @@ def mutate_bytes(data: bytes, chance: random.Random) -> bytes:
 
 def mutate_json(value: Any, chance: random.Random) -> Any:
     """A value with a random part replaced, removed or repeated."""
-    if isinstance(value, dict | list) and value and chance.random() < 0.85:
-        key = chance.choice(sorted(value)) if isinstance(value, dict) else chance.randrange(len(value))
-        changed = dict(value) if isinstance(value, dict) else list(value)
-        kind = chance.randrange(8)
-        if kind == 0:
-            del changed[key]  # type: ignore[arg-type]
-        elif kind == 1 and isinstance(changed, list):
-            changed = changed + [changed[key]] * chance.choice([1, 5, 300])  # type: ignore[index]
-        elif kind == 2 and isinstance(changed, dict):
-            changed[chance.choice(["w", "h", "fl_x", "cx", "k1", "near", "far", "background", "pixel_origin", "x"])] = (
-                chance.choice(WEIRD_VALUES)
-            )
-        else:
-            changed[key] = mutate_json(changed[key], chance)  # type: ignore[index]
-        return changed
-    return chance.choice(WEIRD_VALUES)
+    if not isinstance(value, dict | list) or not value or chance.random() > 0.85:
+        return chance.choice(WEIRD_VALUES)
+    changed: Any = value.copy()
+    key = chance.choice(sorted(value)) if isinstance(value, dict) else chance.randrange(len(value))
+    kind = chance.randrange(8)
+    if kind == 0:
+        del changed[key]
+    elif kind == 1 and isinstance(changed, list):
+        changed += [changed[key]] * chance.choice([1, 5, 300])
+    elif kind == 2 and isinstance(changed, dict):
+        changed[chance.choice(KEYS)] = chance.choice(WEIRD_VALUES)
+    else:
+        changed[key] = mutate_json(changed[key], chance)
+    return changed
 
 
 def mutate_png(data: bytes, chance: random.Random) -> bytes:
@@ -111,148 +112,135 @@ def mutate_png(data: bytes, chance: random.Random) -> bytes:
     elif how == 1 and kind == b"IDAT":  # pixels without end, or of other lengths
         body = zlib.compress(bytes(chance.choice([0, 10, 1000, 2**20])))
     elif how == 2:
-        kind, body = (
-            chance.choice([b"tEXt", b"zTXt", b"iTXt", b"iCCP", b"eXIf", b"tRNS", b"PLTE", b"acTL", b"fcTL"]),
-            body,
-        )
+        kind = chance.choice([b"tEXt", b"zTXt", b"iTXt", b"iCCP", b"eXIf", b"tRNS", b"PLTE", b"acTL", b"fcTL"])
     elif how == 3:
         chunks.insert(index, chunks[chance.randrange(len(chunks))])
-    else:
-        body = mutate_bytes(body, chance) if body else body
+    elif body:
+        body = mutate_bytes(body, chance)
     chunks[index] = (kind, body)
     packed = [struct.pack(">I", len(b)) + k + b + struct.pack(">I", zlib.crc32(k + b)) for k, b in chunks]
     return data[:8] + b"".join(packed)
 
 
-class DataSet:
+def data_set(folder: Path) -> Reader:
     """A small scene, one of whose files is spoilt at a time."""
+    (folder / "train").mkdir(parents=True)
+    pose = [[1.0, 0, 0, 0.5], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1.0]]
+    names = ["./train/r_0", "train/r_1.png", "train/r_2.jpg"]
+    frames = [{"file_path": n, "time": i / 2, "transform_matrix": pose} for i, n in enumerate(names)]
+    manifest = {"camera_angle_x": 0.7, "frames": frames}
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 4), dtype=np.uint8)
+    for index in (0, 1):
+        Image.fromarray(pixels).save(folder / "train" / f"r_{index}.png")
+    Image.fromarray(pixels[..., :3]).save(folder / "train" / "r_2.jpg")
+    listed = folder / "transforms_train.json"
+    listed.write_text(json.dumps(manifest))
+    originals = {path: path.read_bytes() for path in (listed, *sorted((folder / "train").iterdir()))}
 
-    def __init__(self, folder: Path) -> None:
-        (folder / "train").mkdir(parents=True)
-        self.folder = folder
-        pose = [[1.0, 0, 0, 0.5], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1.0]]
-        names = ["./train/r_0", "train/r_1.png", "train/r_2.jpg"]
-        self.manifest: dict[str, Any] = {
-            "camera_angle_x": 0.7,
-            "frames": [{"file_path": n, "time": i / 2, "transform_matrix": pose} for i, n in enumerate(names)],
-        }
-        pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 4), dtype=np.uint8)
-        for index in (0, 1):
-            Image.fromarray(pixels).save(folder / "train" / f"r_{index}.png")
-        Image.fromarray(pixels[..., :3]).save(folder / "train" / "r_2.jpg")
-        self.originals = {path: path.read_bytes() for path in (folder / "train").iterdir()}
-        self.path = folder / "transforms_train.json"
-        self.originals[self.path] = json.dumps(self.manifest).encode()
-        self.path.write_bytes(self.originals[self.path])
-
-    def __call__(self, chance: random.Random) -> None:
-        path = chance.choice([self.path, *sorted(self.originals)])
-        data = self.originals[path]
-        if path == self.path and chance.random() < 0.7:
-            value = self.manifest
+    def read(chance: random.Random) -> None:
+        path = chance.choice([listed, *originals])
+        data = spoilt = originals[path]
+        if path == listed and chance.random() < 0.7:
+            value = manifest
             for _ in range(chance.choice([1, 1, 2])):
                 value = mutate_json(value, chance)
-            path.write_bytes(json.dumps(value).encode())
+            spoilt = json.dumps(value).encode()
         elif path.suffix == ".png" and chance.random() < 0.6:
-            path.write_bytes(mutate_png(data, chance))
+            spoilt = mutate_png(data, chance)
         else:
-            path.write_bytes(mutate_bytes(data, chance))
+            spoilt = mutate_bytes(data, chance)
+        path.write_bytes(spoilt)
         try:
-            frames = load_blender(self.folder, "train", chance.choice([None, 4]))
-            assert frames.images.dtype == torch.uint8
+            assert load_blender(folder, "train", chance.choice([None, 4])).images.dtype == torch.uint8
         finally:
             path.write_bytes(data)
 
+    return read
 
-class Checkpoint:
+
+def mutate_tensors(tensors: dict[str, torch.Tensor], chance: random.Random) -> dict[str, torch.Tensor]:
+    """One of them renamed, removed, or given another dtype, size or value."""
+    name = chance.choice(sorted(tensors))
+    others = {key: value for key, value in tensors.items() if key != name}
+    value, how = tensors[name], chance.randrange(6)
+    if how == 0:
+        return {**others, name + chance.choice(["x", ".", ""]): value}
+    if how == 1:
+        return {**others, name: value.to(chance.choice([torch.float64, torch.int8, torch.bool, torch.bfloat16]))}
+    if how == 2:
+        return {**others, name: value.reshape(-1)[: chance.randrange(value.numel() + 1)]}
+    if how == 3:
+        noise = torch.tensor(list(chance.randbytes(64)), dtype=torch.uint8)
+        raw = value.reshape(-1).view(torch.uint8)
+        noise = noise.repeat(-(-raw.numel() // 64))[: raw.numel()]
+        return {**others, name: noise.view(value.dtype).reshape(value.shape)}
+    if how == 4:
+        return {**others, chance.choice(["optimizer.x.step", "optimizer.", "random.", "renderer.", "x" * 4000]): value}
+    return others
+
+
+def mutate_safetensors(data: bytes, chance: random.Random) -> bytes:
+    if chance.random() < 0.5:
+        return mutate_bytes(data, chance)
+    length = int.from_bytes(data[:8], "little")
+    header = mutate_bytes(data[8 : 8 + length], chance)  # its length is made good again
+    return len(header).to_bytes(8, "little") + header + data[8 + length :]
+
+
+def checkpoint(folder: Path) -> Reader:
     """A state of training and weights, spoilt as bytes, or as tensors and facts with a good digest."""
+    (folder / "checkpoints").mkdir(parents=True)
+    run = run_of(small_renderer())
+    data = encode_run(run, "frames")
+    tensors, facts = decode(data)
+    weights, path = folder / "weights.safetensors", folder / "checkpoints/step_00000005.safetensors"
+    save_weights(run.renderer, weights)
+    original = weights.read_bytes()
 
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True)
-        self.state = state_of(small_renderer())
-        self.data = self.state.encode()
-        self.tensors, self.facts = decode(self.data)
-        self.weights = folder / "weights.safetensors"
-        save_weights(self.state.modules["renderer"], self.weights)
-        self.original = self.weights.read_bytes()
-        self.folder = folder / "checkpoints"
-        self.folder.mkdir()
-
-    def __call__(self, chance: random.Random) -> None:
+    def read(chance: random.Random) -> None:
         kind = chance.randrange(4)
         if kind == 0:
-            self.weights.write_bytes(self._spoilt(self.original, chance))
-            load_weights(self.state.modules["renderer"], self.weights)
+            weights.write_bytes(mutate_safetensors(original, chance))
+            load_weights(run.renderer, weights)
         elif kind == 1:
-            path = self.folder / "step_00000005.safetensors"
-            path.write_bytes(self._spoilt(self.data, chance))
-            assert CheckpointFolder(self.folder).read(limit(self.state)) is not None
+            path.write_bytes(mutate_safetensors(data, chance))
+            assert CheckpointFolder(path.parent).read(max_bytes(run)) is not None
         elif kind == 2:
-            facts = mutate_json(self.facts, chance)
-            text = json.dumps(facts)
-            if "NaN" in text or "Infinity" in text or not isinstance(facts, dict):
+            changed = mutate_json(facts, chance)
+            text = json.dumps(changed)
+            if "NaN" in text or "Infinity" in text or not isinstance(changed, dict):
                 raise ValueError("no facts")  # `encode` refuses those
-            self.state.restore(encode(self.tensors, facts), "mutated", max_rays=64)
+            restore_run(run, encode(tensors, changed), "mutated", "frames")
         else:
-            tensors = dict(self.tensors)
-            name = chance.choice(sorted(tensors))
-            value = tensors.pop(name)
-            how = chance.randrange(6)
-            if how == 0:
-                tensors[name + chance.choice(["x", ".", ""])[:1]] = value
-            elif how == 1:
-                tensors[name] = value.to(chance.choice([torch.float64, torch.int8, torch.bool, torch.bfloat16]))
-            elif how == 2:
-                tensors[name] = value.reshape(-1)[: chance.randrange(value.numel() + 1)]
-            elif how == 3:
-                noise = torch.tensor([chance.randrange(256) for _ in range(64)], dtype=torch.uint8)
-                raw = value.reshape(-1).view(torch.uint8)
-                tensors[name] = (
-                    noise.repeat(-(-raw.numel() // 64))[: raw.numel()].view(value.dtype).reshape(value.shape)
-                )
-            elif how == 4:
-                tensors[chance.choice(["optimizer.x.step", "optimizer.", "random.", "renderer.", "x" * 4000])] = value
-            self.state.restore(encode(tensors, self.facts), "mutated", max_rays=64)
+            restore_run(run, encode(mutate_tensors(tensors, chance), facts), "mutated", "frames")
 
-    @staticmethod
-    def _spoilt(data: bytes, chance: random.Random) -> bytes:
-        length = int.from_bytes(data[:8], "little")
-        if chance.random() < 0.5:  # the header, its length made good again
-            header = mutate_bytes(data[8 : 8 + length], chance)
-            return len(header).to_bytes(8, "little") + header + data[8 + length :]
-        return mutate_bytes(data, chance)
+    return read
 
 
-class Config:
+def config(folder: Path) -> Reader:
     """The config of a run."""
+    import yaml
 
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True)
-        self.folder = folder
-        self.path = folder / "config.yaml"
-        self.value = {
-            "seed": 0,
-            "data": {"_target_": "dnerf.data.BlenderData", "root": "x", "box": [[-1, -1, -1], [1, 1, 1]]},
-            "renderer": {"_target_": "dnerf.renderer.Renderer", "field": {"_target_": "dnerf.fields.NeRFField"}},
-        }
+    folder.mkdir(parents=True)
+    value = {
+        "seed": 0,
+        "data": {"_target_": "dnerf.data.BlenderData", "root": "x", "box": [[-1, -1, -1], [1, 1, 1]]},
+        "renderer": {"_target_": "dnerf.rendering.Renderer", "field": {"_target_": "dnerf.fields.NeRFField"}},
+    }
 
-    def __call__(self, chance: random.Random) -> None:
-        import yaml
-
-        text = yaml.safe_dump(mutate_json(self.value, chance) if chance.random() < 0.5 else self.value)
+    def read(chance: random.Random) -> None:
+        text = yaml.safe_dump(mutate_json(value, chance) if chance.random() < 0.5 else value)
         data = text.encode("utf-8", "replace")
-        self.path.write_bytes(data if chance.random() < 0.3 else mutate_bytes(data, chance))
-        hydra_app.load_config(str(self.folder))
+        (folder / "config.yaml").write_bytes(data if chance.random() < 0.3 else mutate_bytes(data, chance))
+        load_config(folder)
+
+    return read
 
 
-READERS: dict[str, Callable[[Path], Callable[[random.Random], None]]] = {
-    "data set": DataSet,
-    "checkpoint": Checkpoint,
-    "config": Config,
-}
+READERS = {"data set": data_set, "checkpoint": checkpoint, "config": config}
 
 
-def read_spoilt(reader: Callable[[random.Random], None], chance: random.Random) -> str | None:
+def read_spoilt(reader: Reader, chance: random.Random) -> str | None:
     """Give a reader one mutated input; what was wrong with its answer, or None."""
     begin = time.process_time()  # other programs are not the reader's fault
     try:
@@ -270,13 +258,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--reader", choices=sorted(READERS), action="append")
     given = parser.parse_args()
     import logging
 
     logging.disable(logging.WARNING)
     failures, slowest, begin = 0, 0.0, time.perf_counter()
-    names = given.reader or sorted(READERS)
+    names = sorted(READERS)
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as place:
         readers = {name: READERS[name](Path(place) / name.replace(" ", "_")) for name in names}
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

@@ -23,10 +23,11 @@ from preload import load_everything
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = (
     "experiment=demo", "data.resolution=24", "data.num_train=4", "data.num_val=1", "data.num_test=1",
-    "field.resolutions=[8,16,32]", "sampler.resolution=24", "sampler.num_slabs=4", "sampler.update_every=4",
-    "sampler.num_probes=2048", "trainer.max_seconds=null", "trainer.num_rays=64", "trainer.target_samples=2048",
-    "trainer.num_steps=40", "trainer.checkpoint_every=3", "trainer.log_every=5", "trainer.progress_bar=false",
-    "preview_every=20",
+    "field.resolutions=[8,16,32]", "sampler.grid.resolution=24", "sampler.grid.num_slabs=4",
+    "+sampler.grid.update_every=4", "+sampler.grid.num_probes=2048", "trainer.max_seconds=null", "trainer.num_rays=64",
+    "trainer.target_samples=2048", "trainer.num_steps=40", "trainer.callbacks.checkpoints.every=3",
+    "trainer.log_every=5", "~trainer.callbacks.progress_bar", "+trainer/callbacks=previews",
+    "trainer.callbacks.previews.every=20",
 )  # fmt: skip
 
 
@@ -67,7 +68,6 @@ def kill(folder: Path, delay: float, *, while_writing: bool) -> str:
     """Start a run and kill it after a delay, or at the first half-written checkpoint after it; how it ended."""
     pid = start(folder, "resume=true")
     end = time.perf_counter() + delay
-    caught = False
     while os.waitpid(pid, os.WNOHANG) == (0, 0):
         if time.perf_counter() >= end:
             caught = any(folder.glob("checkpoints/.tmp-*"))
@@ -79,8 +79,8 @@ def kill(folder: Path, delay: float, *, while_writing: bool) -> str:
     return "had ended"
 
 
-def files(folder: Path) -> list[str]:
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+def files(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
 def log(folder: Path) -> list[dict[str, object]]:
@@ -91,19 +91,16 @@ def log(folder: Path) -> list[dict[str, object]]:
 
 def differences(folder: Path, expected: Path) -> list[str]:
     """What distinguishes two finished runs, times apart."""
-    from dnerf.checkpoints import decode
+    from dnerf.training.tensor_files import decode
 
-    found = []
-    if files(folder) != files(expected):
-        found.append(f"files: {sorted(set(files(folder)) ^ set(files(expected)))}")
+    found = [f"file: {name}" for name in sorted(files(folder) ^ files(expected))]
     if (folder / "model.safetensors").read_bytes() != (expected / "model.safetensors").read_bytes():
         found.append("weights")
     if log(folder) != log(expected):
         found.append("log")
     for path in sorted(expected.glob("checkpoints/*")):
-        (tensors, facts), (others, other_facts) = (
-            decode(p.read_bytes()) for p in (path, folder / "checkpoints" / path.name)
-        )
+        both = (decode(p.read_bytes()) for p in (path, folder / "checkpoints" / path.name))
+        (tensors, facts), (others, other_facts) = both
         assert facts is not None
         assert other_facts is not None
         found += [f"{path.name}: {n}" for n in tensors if tensors[n].numpy().tobytes() != others[n].numpy().tobytes()]

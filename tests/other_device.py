@@ -51,7 +51,13 @@ class Elsewhere(Tensor):
 
 def _dispatched(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     name = function.overloadpacket.__name__
-    given = list(_tensors((args, kwargs)))
+    given: list[Tensor] = []
+
+    def held(x: Tensor) -> Tensor:
+        given.append(x)
+        return x.held if isinstance(x, Elsewhere) else x
+
+    held_args, held_kwargs = _mapped(held, (args, kwargs))
     is_there = any(isinstance(x, Elsewhere) for x in given)
     wanted = kwargs.get("device")
     if wanted is None and not is_there:
@@ -65,7 +71,6 @@ def _dispatched(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
                 raise RuntimeError(f"{function}: a tensor {tuple(x.shape)} lies on the {x.device}, others {NAME}")
     elif name == "copy_":
         is_there = isinstance(args[0], Elsewhere)
-    held_args, held_kwargs = _mapped(lambda x: x.held if isinstance(x, Elsewhere) else x, (args, kwargs))
     if is_there and wanted is not None:
         held_kwargs["device"] = torch.device("cpu")
     outputs = function(*held_args, **held_kwargs)
@@ -82,19 +87,8 @@ def _aliases(function: Any) -> bool:
     return any(part.alias_info is not None for part in (*schema.arguments, *schema.returns))
 
 
-def _tensors(node: Any) -> Iterator[Tensor]:
-    """The tensors in what operations are given, lists and mappings included (as torch's trees, which take longer)."""
-    if isinstance(node, Tensor):
-        yield node
-    elif isinstance(node, tuple | list):
-        for child in node:
-            yield from _tensors(child)
-    elif isinstance(node, dict):
-        yield from _tensors(list(node.values()))
-
-
 def _mapped(change: Callable[[Tensor], Tensor], node: Any) -> Any:
-    """The same with each tensor changed."""
+    """The same with each tensor changed (as torch's trees do, which take longer)."""
     if isinstance(node, Tensor):
         return change(node)
     if isinstance(node, tuple | list):

@@ -4,6 +4,8 @@ import importlib
 import pkgutil
 from pathlib import Path
 
+import dnerf
+
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
 
@@ -11,10 +13,10 @@ def load_everything() -> None:
     """Load it; nothing that starts threads, which a forked child would lack."""
     from hydra import compose, initialize_config_dir
 
-    for name in ("torch._dynamo", "torchmetrics", "dnerf", "dnerf.kernels.cpu"):
-        module = importlib.import_module(name)
-        if name.startswith("dnerf"):
-            for part in pkgutil.iter_modules(module.__path__, f"{name}."):
-                importlib.import_module(part.name)
+    for name in ("torch._dynamo", "torchmetrics"):
+        importlib.import_module(name)
+    for part in pkgutil.walk_packages(dnerf.__path__, "dnerf."):
+        if not part.name.startswith("dnerf.kernels.gpu."):
+            importlib.import_module(part.name)
     with initialize_config_dir(str(CONF), version_base="1.3"):
         compose("train")

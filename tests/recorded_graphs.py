@@ -15,10 +15,11 @@ from device_waits import DeviceWaits
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from dnerf.graphs import GraphCache, Work, _Graph
 from dnerf.kernels.march import MarchedSamples
 from dnerf.kernels.march_to_size import march_to_size
-from dnerf.renderer import Renderer
+from dnerf.rendering.cuda_graphs import GraphCache, Work, _Graph
+from dnerf.rendering.frame_graphs import FrameGraphs
+from dnerf.rendering.renderer import Renderer
 from dnerf.samplers.occupancy_grid import OccupancyGrid, spread_over
 
 
@@ -40,9 +41,16 @@ def _one_operation(*rays: Tensor, **others: Any) -> tuple[MarchedSamples, Tensor
     return MarchedSamples(*columns), wanted
 
 
-def _places(grid: OccupancyGrid, unit: Tensor) -> tuple[Tensor, Tensor]:
-    """`OccupancyGrid.places` as on a GPU: on the CPU it keeps a list of any length."""
+def _occupied_positions(grid: OccupancyGrid, unit: Tensor) -> tuple[Tensor, Tensor]:
+    """`OccupancyGrid.occupied_positions` as on a GPU: on the CPU it keeps a list of any length."""
     return grid._within(spread_over(grid.occupied, unit[:, 0]), unit[:, 1:])
+
+
+def _graph_frames(renderer: Renderer) -> FrameGraphs | None:
+    """As on a GPU."""
+    if renderer.graphs and renderer._frames is None:
+        renderer._frames = FrameGraphs(renderer.device)
+    return renderer._frames
 
 
 def _memory(values: Any) -> set[int]:
@@ -80,13 +88,7 @@ class _Recording(DeviceWaits):
 
 
 class RecordedCache(GraphCache):
-    """A cache of graphs that records and replays on the CPU, too.
-
-    Attributes:
-        replays: how often something was replayed.
-        recordings: how often something was recorded.
-        is_recording: whether something is just now.
-    """
+    """A cache of graphs that records and replays on the CPU, too, and counts both."""
 
     replays = 0
     recordings = 0
@@ -117,7 +119,7 @@ class RecordedCache(GraphCache):
 
 @contextmanager
 def recorded_graphs(*, replays: bool = True) -> Iterator[type[RecordedCache]]:
-    """Within a `with` block, steps and pictures that a GPU would replay are replayed on the CPU.
+    """Within a `with` block, steps and images that a GPU would replay are replayed on the CPU.
 
     Args:
         replays: False for the same work done anew each time, with which replays agree to the last bit.
@@ -125,11 +127,11 @@ def recorded_graphs(*, replays: bool = True) -> Iterator[type[RecordedCache]]:
     RecordedCache.replays = RecordedCache.recordings = 0
     cache = RecordedCache if replays else GraphCache
     with (
-        patch("dnerf.training.GraphCache", cache),
-        patch("dnerf.frame_graphs.GraphCache", cache),
+        patch("dnerf.training.trainer.GraphCache", cache),
+        patch("dnerf.rendering.frame_graphs.GraphCache", cache),
         patch("dnerf.deformations.flow._is_recorded", lambda _: RecordedCache.is_recording),
-        patch.object(OccupancyGrid, "places", _places),
+        patch.object(OccupancyGrid, "occupied_positions", _occupied_positions),
         patch("dnerf.samplers.occupancy.march_to_size", _one_operation),
-        patch.object(Renderer, "_replays", property(lambda renderer: renderer.graphs)),
+        patch.object(Renderer, "_graph_frames", _graph_frames),
     ):
         yield RecordedCache

@@ -4,13 +4,20 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from dnerf.compositing import FieldOutput
+from dnerf.core.compositing import FieldOutput
+from dnerf.core.rays import Rays, Samples
+from dnerf.core.schedules import Ramp
 from dnerf.fields.base import RadianceField
-from dnerf.rays import Rays
+from dnerf.rendering.renderer import Renderer
+from dnerf.samplers import OccupancyGrid, OccupancySampler, Sampler
+from dnerf.scenes import AnalyticScene
+
+OF_THE_GRID = {"num_slabs", "threshold", "decay", "update_every", "num_probes", "dilation", "render_dilation"}
 
 
 def transmittance(optical_depths: Sequence[float]) -> float:
@@ -162,3 +169,39 @@ def rays_towards_origin(num_rays: int, dtype: torch.dtype = torch.float32, seed:
     times = torch.rand(num_rays, generator=generator, dtype=torch.float64)
     ones = torch.ones_like(times)
     return Rays(3 * origins, directions, times, ones, 5 * ones).to(dtype)
+
+
+def occupancy_sampler(
+    box: Sequence[Sequence[float]],
+    step_size: float = 0.02,
+    resolution: int = 64,
+    *,
+    kind: type[OccupancySampler] = OccupancySampler,
+    coarse_step: float | None = None,
+    coarse_until: float = 0.5,
+    **others: Any,
+) -> OccupancySampler:
+    """An occupancy sampler of some kind and its grid, from the settings of both.
+
+    Training begins with `coarse_step`, if given, and reaches `step_size`, that of images, by equal factors at progress
+    `coarse_until`, from which on intervals are cut.
+    """
+    grid = OccupancyGrid(box, resolution, **{name: others.pop(name) for name in OF_THE_GRID & others.keys()})
+    step = step_size if coarse_step is None else Ramp(coarse_step, step_size, end=coarse_until, kind="exponential")
+    return kind(grid, step, **{"subdivide_from": coarse_until, **others})
+
+
+class ExactSampler(Sampler):
+    """Samples of an exact scene: its bodies' own intervals along rays."""
+
+    def __init__(self, scene: AnalyticScene) -> None:
+        super().__init__()
+        self.scene = scene
+
+    def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
+        return self.scene.exact_samples(rays)
+
+
+def exact(scene: AnalyticScene) -> Renderer:
+    """An exact scene as a model."""
+    return Renderer(scene, ExactSampler(scene)).eval()

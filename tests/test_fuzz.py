@@ -1,16 +1,15 @@
 """Readers of others' files under mutated inputs: a documented error or a good result; and the cases found."""
 
 import random
-from collections.abc import Callable
 from pathlib import Path
 
 import fuzz_readers
-import hydra_app
 import pytest
+from fuzz_readers import Reader
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-Reader = Callable[[random.Random], None]
+from dnerf.training.runs import load_config
 
 
 @pytest.fixture(scope="module", params=sorted(fuzz_readers.READERS))
@@ -64,5 +63,5 @@ def test_the_fuzzer_notices_what_it_looks_for(name: str, tmp_path: Path) -> None
 def test_hostile_configs_are_refused_at_once(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(ValueError, match=r"config\.yaml") as error:
-        hydra_app.load_config(str(tmp_path))
+        load_config(tmp_path)
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Pictures of a moving scene held as uint8, each with its camera pose and time."""
+"""Images of a moving scene held as uint8, each with its camera pose and time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,27 +6,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dnerf.backgrounds import parse_color
-from dnerf.cameras import Camera, Intrinsics, camera_rays
-from dnerf.checks import check_shape
-from dnerf.rays import Rays
+from dnerf.core.backgrounds import parse_color
+from dnerf.core.cameras import Camera, Intrinsics, camera_rays
+from dnerf.core.checks import check_shape
+from dnerf.core.rays import Rays
 
 RIGID_TOLERANCE = 1e-3
 
 
 def composite_on(rgba: Tensor, background: Tensor) -> Tensor:
-    """Put premultiplied colour on a background: `rgb + (1 - alpha) background`.
-
-    Args:
-        rgba: (..., 4) in [0, 1], colour already multiplied by alpha.
-        background: broadcastable to (..., 3), in [0, 1].
-
-    Returns:
-        (..., 3) in [0, 1].
-
-    Raises:
-        ValueError: if the last axes are not 4 and 3 long.
-    """
+    """Put premultiplied colour (..., 4) on a background (..., 3), all in [0, 1]: `rgb + (1 - alpha) background`."""
     if rgba.shape[-1:] != (4,) or background.shape[-1:] != (3,):
         raise ValueError(
             "rgba and background must have shapes (..., 4) and (..., 3), "
@@ -48,34 +37,24 @@ def is_rigid(poses: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """F pictures of one scene, each with a camera-to-world pose and a time; all share one pinhole camera.
+    """F images of one scene, each with a camera-to-world pose and a time; all share one pinhole camera.
 
-    With four channels the colour is **premultiplied** by alpha, rounded once to 8 bits, so that a picture on
+    With four channels the colour is **premultiplied** by alpha, rounded once to 8 bits, so that an image on
     background b is `images[..., :3] / 255 + (1 - images[..., 3] / 255) b`. Memory is that of `images`: 200 frames
     of 400 x 400 with alpha take 128 MB.
-
-    Args:
-        images: (F, H, W, C) uint8, C = 3 (opaque) or 4 (premultiplied alpha).
-        poses: (F, 4, 4) float32, camera-to-world, rigid, OpenGL axes.
-        times: (F,) float32 in [0, 1].
-        intrinsics: camera with width W and height H.
-        near: z-depth where rays begin, in world units.
-        far: z-depth where rays end.
-        background: what opaque pictures (C = 3) show behind the scene, as a name or three numbers; None if unknown.
-        names: F names for messages and files, or none.
 
     Raises:
         ValueError: if shapes or types do not fit, a pose is not rigid or a time lies outside [0, 1].
     """
 
-    images: Tensor
-    poses: Tensor
-    times: Tensor
-    intrinsics: Intrinsics
-    near: float = 2.0
-    far: float = 6.0
-    background: str | Sequence[float] | None = None
-    names: tuple[str, ...] = ()
+    images: Tensor  # (F, H, W, C) uint8, C = 3 (opaque) or 4 (premultiplied alpha)
+    poses: Tensor  # (F, 4, 4) float32, camera-to-world, rigid, OpenGL axes
+    times: Tensor  # (F,) float32 in [0, 1]
+    intrinsics: Intrinsics  # camera with width W and height H
+    near: float = 2.0  # z-depth where rays begin, in world units
+    far: float = 6.0  # z-depth where rays end
+    background: str | Sequence[float] | None = None  # name or 3 numbers behind opaque images (C = 3); None if unknown
+    names: tuple[str, ...] = ()  # F names for messages and files, or none
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
@@ -109,7 +88,7 @@ class Frames:
 
     @property
     def has_alpha(self) -> bool:
-        """Whether the pictures have an alpha channel and so premultiplied colour."""
+        """Whether the images have an alpha channel and so premultiplied colour."""
         return self.images.shape[-1] == 4
 
     @property
@@ -121,30 +100,32 @@ class Frames:
         """The camera of one frame."""
         return Camera(self.intrinsics, self.poses[index], self.near, self.far)
 
-    def image(self, index: int, background: Sequence[float] | Tensor = (1.0, 1.0, 1.0)) -> Tensor:
-        """One picture on a background (3,), (H, W, 3) float32 in [0, 1]; opaque pictures ignore the background."""
+    @property
+    def is_transparent(self) -> bool:
+        """Whether any pixel is not opaque; an alpha channel that is 255 everywhere says nothing of what lies behind."""
+        return self.has_alpha and bool((self.images[..., 3] < 255).any())
+
+    def image(self, index: int, background: Sequence[float] | Tensor | None = None) -> Tensor:
+        """One image on a background, (H, W, 3) float32 in [0, 1].
+
+        Images with alpha need a background (3,) in [0, 1], as the renderer has it (else ValueError); opaque ones ignore
+        it.
+        """
+        pixels = self.images[index].float() / 255
+        if not self.has_alpha:
+            return pixels
+        if background is None:
+            raise ValueError("background must be three numbers in [0, 1] for images with alpha, got None")
         color = torch.as_tensor(background, dtype=torch.float32, device=self.images.device)
         check_shape("background", color, (3,))
-        picture = self.images[index].float() / 255
-        return composite_on(picture, color) if self.has_alpha else picture
-
-    def alpha(self, index: int) -> Tensor:
-        """One picture's alpha, (H, W) float32 in [0, 1]; 1 everywhere for opaque pictures."""
-        if not self.has_alpha:
-            return torch.ones(self.images.shape[1:3], device=self.images.device)
-        return self.images[index, ..., 3].float() / 255
+        return composite_on(pixels, color)
 
     def pixels(self, indices: Tensor) -> tuple[Rays, Tensor]:
-        """Rays and colours of any pixels of any frames.
+        """Rays (B), each at its frame's time, and premultiplied colours (B, 4) float32 (alpha 1 if opaque) of any
+        pixels.
 
-        Args:
-            indices: (B,) int64 in [0, num_pixels), on the device of the images: `(frame * H + row) * W + column`.
-
-        Returns:
-            B rays, each at its frame's time, and their colours (B, 4) float32, premultiplied (alpha 1 if opaque).
-
-        Raises:
-            ValueError: if indices are not a row of int64.
+        Indices (B,) int64 in [0, num_pixels), on the images' device, are `(frame * H + row) * W + column`; ValueError
+        for another shape or type.
         """
         check_shape("indices", indices, ("B",))
         if indices.dtype != torch.int64:
@@ -156,32 +137,19 @@ class Frames:
         rows = indices // width
         frames = rows // height
         rays = camera_rays(
-            self.intrinsics,
-            self.poses.index_select(0, frames),
-            indices - rows * width,
-            rows - frames * height,
-            times=self.times.index_select(0, frames),
-            near=self.near,
-            far=self.far,
-        )
+            self.intrinsics, self.poses.index_select(0, frames), indices - rows * width, rows - frames * height,
+            times=self.times.index_select(0, frames), near=self.near, far=self.far,
+        )  # fmt: skip
         return rays, rgba
 
     def subset(self, indices: Sequence[int]) -> "Frames":
-        """The frames with the given indices, in that order (a copy).
-
-        Raises:
-            ValueError: if there are none, or one does not exist.
-        """
+        """The frames with the given indices, in that order (a copy); ValueError for none, or one that is not there."""
         if not len(indices) or not all(-len(self) <= i < len(self) for i in indices):
             raise ValueError(f"indices must name some of {len(self)} frames, got {list(indices)[:8]}")
         chosen = torch.as_tensor([i % len(self) for i in indices], device=self.images.device)
-        return replace(
-            self,
-            images=self.images.index_select(0, chosen),
-            poses=self.poses.index_select(0, chosen),
-            times=self.times.index_select(0, chosen),
-            names=tuple(self.names[i] for i in indices) if self.names else (),
-        )
+        images, poses, times = (values.index_select(0, chosen) for values in (self.images, self.poses, self.times))
+        names = tuple(self.names[i] for i in indices) if self.names else ()
+        return replace(self, images=images, poses=poses, times=times, names=names)
 
     def to(self, device: str | torch.device) -> "Frames":
         """The same frames on another device."""

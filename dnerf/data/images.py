@@ -20,9 +20,8 @@ Bytes = NDArray[np.uint8]
 def read_header(path: Path) -> tuple[int, int, bool]:
     """Width, height and whether an image file has alpha, without decoding it.
 
-    Raises:
-        ValueError: naming the file, if it is missing, not a PNG or JPEG with 8 bits per channel, or larger than
-            2^25 pixels or 2^14 on a side.
+    Raises ValueError naming the file, if it is missing, not a PNG or JPEG with 8 bits per channel, or larger than 2^25
+    pixels or 2^14 on a side.
     """
     with _open(path) as image:
         try:
@@ -32,31 +31,35 @@ def read_header(path: Path) -> tuple[int, int, bool]:
 
 
 def read_image(path: Path, *, width: int, height: int, channels: int, size: tuple[int, int]) -> Bytes:
-    """Decode an image, premultiply by alpha, average over pixel areas and round once.
+    """Decode an image, premultiply by alpha, average over pixel areas and round once: (height, width, channels) uint8.
+
+    Palettes and grey are expanded to colour.
 
     Args:
-        path: a PNG or JPEG file; palettes and grey are expanded to colour.
+        path: a PNG or JPEG file of `size`, (width, height).
         width: columns of the result, at most the file's.
         height: rows of the result, at most the file's.
-        channels: 4 for premultiplied colour and alpha, 3 for an image without alpha.
-        size: (width, height) the file must have.
-
-    Returns:
-        (height, width, channels) uint8.
+        channels: 4 for premultiplied colour and alpha, 3 for an image that is opaque everywhere.
 
     Raises:
-        ValueError: naming the file, as `read_header`, or if it is truncated or of another size.
+        ValueError: naming the file, as `read_header`, or if it is truncated, of another size, or transparent somewhere
+            where `channels` is 3.
     """
-    mode = "RGBA" if channels == 4 else "RGB"
     with _open(path) as image:
         if image.size != size:
             raise ValueError(f"{path}: image must be {size[0]} x {size[1]}, got {image.width} x {image.height}")
-        try:
-            pixels = np.asarray(image if image.mode == mode else image.convert(mode))
-        # A decoder given hostile bytes raises many types (OSError, SyntaxError, zlib.error, struct.error, ...).
-        except Exception as error:
-            raise ValueError(f"{path}: image is truncated or broken: {_one_line(error)}") from error
+        pixels = _decoded(image, path, with_alpha=channels == 4)
+    if pixels.shape[-1] > channels:
+        if pixels[..., 3].min() < 255:
+            raise ValueError(f"{path}: image must be opaque, as the training images are, got transparent pixels")
+        pixels = pixels[..., :channels]
     return premultiplied_area_average(pixels, width, height)
+
+
+def is_transparent(path: Path) -> bool:
+    """Whether any pixel of an image is not opaque: its header tells only that one may be; fails as `read_image`."""
+    with _open(path) as image:
+        return bool(_decoded(image, path, with_alpha=True)[..., 3].min() < 255)
 
 
 def premultiplied_area_average(pixels: Bytes, width: int, height: int) -> Bytes:
@@ -66,15 +69,10 @@ def premultiplied_area_average(pixels: Bytes, width: int, height: int) -> Bytes:
     weights are integers and the sums are exact.
 
     Args:
-        pixels: (H, W, 3) colour or (H, W, 4) colour and straight alpha, uint8.
-        width: columns of the result, at most W.
-        height: rows of the result, at most H.
-
-    Returns:
-        (height, width, 3 or 4) uint8, colour at most alpha.
-
-    Raises:
-        ValueError: if the result would be larger than the source, or empty.
+        pixels: (H, W, 3) colour or (H, W, 4) colour and straight alpha, uint8, of which (height, width, 3 or 4) are
+            made.
+        width: columns of the result, in 1..W; ValueError otherwise.
+        height: rows of the result, in 1..H.
     """
     source_height, source_width, channels = pixels.shape
     if not (0 < width <= source_width and 0 < height <= source_height):
@@ -92,7 +90,9 @@ def premultiplied_area_average(pixels: Bytes, width: int, height: int) -> Bytes:
     for first in range(0, height, band):
         last = min(first + band, height)
         top, bottom = first * source_height // height, -(-last * source_height // height)
-        wide = _premultiplied(pixels[top:bottom], np.uint32 if whole else np.int64)
+        wide: NDArray = pixels[top:bottom].astype(np.uint32 if whole else np.int64)
+        if channels == 4:
+            wide[..., :3] *= wide[..., 3:]
         if whole:
             sums = _block_sums(wide, last - first, width)
         else:
@@ -117,13 +117,6 @@ def straight_alpha(pixels: Bytes) -> Bytes:
     straight = pixels.copy()
     straight[..., :3] = np.minimum((pixels[..., :3] * np.uint32(255) + divisor // 2) // divisor, 255)
     return straight
-
-
-def _premultiplied(pixels: Bytes, dtype: type) -> NDArray:
-    wide: NDArray = pixels.astype(dtype)
-    if pixels.shape[-1] == 4:
-        wide[..., :3] *= wide[..., 3:]
-    return wide
 
 
 def _block_sums(values: NDArray, num_rows: int, num_columns: int) -> NDArray:
@@ -179,6 +172,16 @@ def _open(path: Path) -> Image.Image:
         return image
     image.close()
     raise ValueError(f"{path}: image must be {problem}")
+
+
+def _decoded(image: Image.Image, path: Path, *, with_alpha: bool) -> Bytes:
+    """Pixels (H, W, 4) uint8 with straight alpha, or (H, W, 3) if the file has none and none is wanted."""
+    try:
+        mode = "RGBA" if with_alpha or image.has_transparency_data else "RGB"
+        return np.asarray(image if image.mode == mode else image.convert(mode))
+    # A decoder given hostile bytes raises many types (OSError, SyntaxError, zlib.error, struct.error, ...).
+    except Exception as error:
+        raise ValueError(f"{path}: image is truncated or broken: {_one_line(error)}") from error
 
 
 def _one_line(error: Exception) -> str:

@@ -1,42 +1,22 @@
 """What a deformation is: a map from world to canonical positions, one time per position."""
 
 from abc import ABC, abstractmethod
-from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
-from dnerf.checks import check_batch
-from dnerf.geometry import check_last_axis
-
-
-@runtime_checkable
-class BeginsAtZero(Protocol):
-    """A part that may be zero at initialisation, so that what it moves stays where it is."""
-
-    def rest(self) -> None:
-        """Be zero again, if it was zero then."""
+from dnerf.core.checks import check_batch
+from dnerf.core.geometry import check_last_axis
+from dnerf.core.shortcuts import speaks_for
 
 
 class Deformation(nn.Module, ABC):
     """Maps world positions at their times to canonical positions."""
 
+    is_identity = False  # whether it moves nothing, at no time, and never will
+
     @abstractmethod
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Canonical positions of world positions.
-
-        Args:
-            positions: (..., 3) in world units.
-            times: (...,) in [0, 1], one per position.
-
-        Returns:
-            (..., 3) canonical positions in world units: positions, never offsets.
-        """
-
-    def begin_anew(self) -> None:
-        """Be the identity again, as at initialisation; what its last layers see stays as it is."""
-        for part in self.modules():
-            if isinstance(part, BeginsAtZero):
-                part.rest()
+        """Canonical positions (..., 3), never offsets, of world positions (..., 3) at times (...,) in [0, 1]."""
 
 
 class InvertibleDeformation(Deformation):
@@ -47,12 +27,54 @@ class InvertibleDeformation(Deformation):
         """World positions (..., 3) at `times` (...,) of canonical positions (..., 3)."""
 
 
-def check_one_time(times: Tensor, time: float) -> None:
-    """Raise unless all times are that one; padded samples carry the time of a ray, too.
+class IdentityDeformation(InvertibleDeformation):
+    """Canonical positions are world positions."""
 
-    Raises:
-        ValueError: saying which there are.
-    """
+    is_identity = True
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Return `positions` (..., 3) as they are."""
+        check_positions_times(positions, times)
+        return positions
+
+    def inverse(self, canonical: Tensor, times: Tensor) -> Tensor:
+        """Return `canonical` (..., 3) as it is."""
+        check_positions_times(canonical, times)
+        return canonical
+
+
+class PerFrame(ABC):
+    """A deformation that has a cheaper stand-in for all positions of one frame."""
+
+    @abstractmethod
+    def at_time(self, time: float, extent: Tensor | None = None) -> Deformation:
+        """The stand-in at one time in [0, 1]; if a box (2, 3) is given, for what lies in it."""
+
+
+def deformation_at_time(deformation: Deformation, time: float, extent: Tensor | None = None) -> Deformation:
+    """Its stand-in at a time, see `PerFrame`; itself without one, or if a subclass has another `forward` than that."""
+    if isinstance(deformation, PerFrame) and speaks_for(deformation, "at_time", "forward"):
+        return deformation.at_time(time, extent)
+    return deformation
+
+
+class WrappedDeformation(Deformation):
+    """A deformation around another one, whose map it approximates: a cache, a spacing along rays."""
+
+    def __init__(self, deformation: Deformation) -> None:
+        super().__init__()
+        self.deformation = deformation
+
+
+def unwrapped(deformation: Deformation) -> Deformation:
+    """The deformation itself, without what approximates it: whose inverse and derivatives are exact."""
+    while isinstance(deformation, WrappedDeformation):
+        deformation = deformation.deformation
+    return deformation
+
+
+def check_one_time(times: Tensor, time: float) -> None:
+    """Raise unless all times are that one; padded samples carry the time of a ray, too."""
     if times.numel() and not any(times.stride()):  # one number, expanded
         times = times.reshape(-1)[:1]
     if times.numel() and not bool((times - time).abs().amax() < 1e-6):
@@ -60,10 +82,6 @@ def check_one_time(times: Tensor, time: float) -> None:
 
 
 def check_positions_times(positions: Tensor, times: Tensor) -> None:
-    """Raise unless positions are (..., 3) and times have their batch shape.
-
-    Raises:
-        ValueError: naming the argument and its shape.
-    """
+    """Raise unless positions are (..., 3) and times have their batch shape."""
     check_last_axis("positions", positions, 3)
     check_batch("times", times, positions)

@@ -1,107 +1,75 @@
 """Neural-ODE flow: a velocity field carries points between any time and the canonical one (Chen et al. 2018)."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import check_choice, check_positive
+from dnerf.core.checks import check_choice, check_positive
 from dnerf.deformations.base import InvertibleDeformation, check_positions_times
-from dnerf.deformations.fixed_point import attach_gradient, invert
+from dnerf.deformations.inversion import attach_gradient, invert
 from dnerf.deformations.solvers import RightHandSide, Solver, failure
 from dnerf.deformations.velocities.base import Velocity
 
-CLOCKS = ("running", "frozen")
-
-
-@dataclass
-class EvaluationCounts:
-    """How often velocity fields were evaluated (each evaluation is of a whole batch).
-
-    Args:
-        last: in the latest solve, forward or inverse; the adjoint's backward solve adds to it.
-        total: since the count was made.
-        solves: number of solves in `total`.
-    """
-
-    last: int = 0
-    total: int = 0
-    solves: int = 0
+IN_TIME = ("varying", "stationary")
 
 
 class FlowDeformation(InvertibleDeformation):
     """The flow of a velocity field: one differential equation for samples that each have their own time.
 
-    - `clock="running"`: matter moves with v, so x(t0) solves `dx/dtau = v(x, tau)` from tau = t to t0, written as
-      `dx/ds = (t0 - t) v(x, t + s (t0 - t))`, s in [0, 1]. v is the physical velocity; it can be extrapolated in time.
-    - `clock="frozen"`: `dx/ds = (t0 - t) v(x, t)`, the exponential of the field of the sample's own time (log-domain
-      diffeomorphisms: Arsigny et al. 2006, Ashburner 2007). As invertible, and the same where v does not depend on
-      time, but errors do not add up over long times and few steps suffice: with one Euler step it is D-NeRF's
-      displacement. v is not the physical velocity. With `canonical_time=None` the factor is 1:
-      no time is canonical.
+    - `velocity_in_time="varying"`: points move with v, so x(t0) solves `dx/dtau = v(x, tau)` from tau = t to t0,
+      written as `dx/ds = (t0 - t) v(x, t + s (t0 - t))`, s in [0, 1]. v is the physical velocity; it can be
+      extrapolated in time.
+    - `velocity_in_time="stationary"`: `dx/ds = (t0 - t) v(x, t)`, the exponential of the field of the sample's own time
+      (log-domain diffeomorphisms: Arsigny et al. 2006, Ashburner 2007). As invertible, and the same where v does not
+      depend on time, but errors do not add up over long times and few steps suffice: with one Euler step it is D-NeRF's
+      displacement. v is not the physical velocity. With `canonical_time=None` the factor is 1: no time is canonical.
 
     Both are the identity at initialisation if v is zero, both compose: motion from t to t' is
     `inverse(forward(x, t), t')`.
 
     The exact flow never folds space. Steps of length h keep the Jacobian determinant positive while the norm of the
-    velocity's gradient stays below 1 / h (Euler) or (sqrt(3) - 1) / h (midpoint), h times |t0 - t| where
-    there is a canonical time; `SmoothVelocityLoss` holds it down in training.
+    velocity's gradient stays below 1 / h (Euler) or (sqrt(3) - 1) / h (midpoint), h times |t0 - t| where there is a
+    canonical time; `dnerf.losses.JacobianDeterminantLoss` keeps it positive in training.
 
     Args:
         velocity: the field, zero outside the scene's box.
-        canonical_time: t0, or None (frozen clock only).
-        clock: "running" or "frozen".
+        canonical_time: t0, or None (stationary velocity only).
+        velocity_in_time: "varying" or "stationary".
         solver: name, see `Solver`.
         num_steps: of a fixed-step solver.
-        rtol: of an adaptive solver.
-        atol: of an adaptive solver, in world units.
+        rtol, atol, max_steps: of an adaptive solver, see `Solver`.
         gradient: "direct" or "adjoint", see `Solver`.
-        max_steps: of an adaptive solver.
         corrections: round trips by which `inverse` is made the inverse of the *discretised* `forward` (see `invert`):
             the equation solved backwards, which 0 leaves as it is, misses it by both solves' errors.
 
     Raises:
-        ValueError: for settings out of range, or a running clock without a canonical time.
+        ValueError: for settings out of range, or a varying velocity without a canonical time.
     """
 
     def __init__(
-        self,
-        velocity: Velocity,
-        canonical_time: float | None = 0.0,
-        *,
-        clock: str = "running",
-        solver: str = "rk4",
-        num_steps: int = 8,
-        rtol: float = 1e-5,
-        atol: float = 1e-6,
-        gradient: str = "direct",
-        max_steps: int = 1000,
-        corrections: int = 10,
-    ) -> None:
+        self, velocity: Velocity, canonical_time: float | None = 0.0, *, velocity_in_time: str = "varying",
+        solver: str = "rk4", num_steps: int = 8, rtol: float = 1e-5, atol: float = 1e-6, gradient: str = "direct",
+        max_steps: int = 1000, corrections: int = 10,
+    ) -> None:  # fmt: skip
         super().__init__()
-        check_choice("clock", clock, CLOCKS)
+        check_choice("velocity_in_time", velocity_in_time, IN_TIME)
         check_positive("corrections", corrections, allow_zero=True)
-        if canonical_time is None and clock == "running":
-            raise ValueError("canonical_time must be a time in [0, 1] for a running clock, got None")
+        if canonical_time is None and velocity_in_time == "varying":
+            raise ValueError("canonical_time must be a time in [0, 1] for a varying velocity, got None")
         if canonical_time is not None and not 0 <= canonical_time <= 1:
             raise ValueError(f"canonical_time must be in [0, 1] or None, got {canonical_time}")
         self.velocity = velocity
         self.canonical_time = canonical_time
-        self.clock = clock
+        self.velocity_in_time = velocity_in_time
         self.solver = Solver(solver, num_steps, rtol=rtol, atol=atol, gradient=gradient, max_steps=max_steps)
         self.corrections = corrections
-        self.evaluations = EvaluationCounts()
-
-    def links(self) -> tuple["FlowDeformation", ...]:
-        """The flows that it is made of (see `FlowChain`): itself."""
-        return (self,)
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Canonical positions (..., 3) of world positions (..., 3) at times (...,).
 
         Raises:
-            ValueError: if times do not fit positions.
             IntegrationError: where the solver fails or positions become infinite.
         """
         check_positions_times(positions, times)
@@ -135,15 +103,11 @@ class FlowDeformation(InvertibleDeformation):
         if not positions.numel():
             return positions
         start, end, spans = self._spans(times, backwards)
-        self.evaluations.last = 0
-        self.evaluations.solves += 1
         right_hand_side = self._right_hand_side(start, spans)
         reached: tuple[float, Tensor] = (0.0, positions)
 
         def watch(s: float | Tensor, x: Tensor) -> None:
             nonlocal reached
-            self.evaluations.last += 1
-            self.evaluations.total += 1
             if self.solver.is_adaptive:
                 reached = (float(torch.as_tensor(s).detach()), x.detach())
 
@@ -157,7 +121,7 @@ class FlowDeformation(InvertibleDeformation):
                 result = self.solver.solve_adjoint(_AdjointEquation(self, watch), (positions, start, spans))[0]
             else:
                 result = self.solver.solve(watched, positions)
-            # A graph that is recorded asks nothing; what is not finite then shows in the loss.
+            # A graph that is recorded reads nothing; what is not finite then shows in the loss.
             if _is_recorded(result) or bool(torch.isfinite(result).all()):
                 return result
         except AssertionError as error:
@@ -171,11 +135,11 @@ class FlowDeformation(InvertibleDeformation):
             return times, times, length
         canonical = torch.full_like(times, self.canonical_time)
         start, end = (canonical, times) if backwards else (times, canonical)
-        return (times, times, end - start) if self.clock == "frozen" else (start, end, end - start)
+        return (times, times, end - start) if self.velocity_in_time == "stationary" else (start, end, end - start)
 
     def _right_hand_side(self, start: Tensor, spans: Tensor) -> RightHandSide:
         column = spans[..., None]
-        if self.clock == "frozen":
+        if self.velocity_in_time == "stationary":
             field = self.velocity.at(start)
             return lambda s, positions: column * field(positions)
         return lambda s, positions: column * self.velocity(positions, start + s * spans)
@@ -198,3 +162,49 @@ class _AdjointEquation(nn.Module):
         positions, start, spans = state
         self._watch(s, positions)
         return self._make(start, spans)(s, positions), torch.zeros_like(start), torch.zeros_like(spans)
+
+
+class FlowChain(InvertibleDeformation):
+    """Flows one after the other, each from where the one before ended.
+
+    With stationary velocities it is one flow whose velocity is another in each part of the way, as in registration with
+    large deformations (Beg et al. 2005): it reaches maps that are not the exponential of one stationary field. Where
+    each takes one Euler step they are residual blocks, invertible while each keeps to its own bound (`FlowDeformation`;
+    Behrmann et al. 2019), so a chain bends more than one flow before it folds: determinants multiply.
+
+    Args:
+        flows: by name, in the order in which world positions meet them.
+
+    Raises:
+        ValueError: if there is none, or something else than a flow.
+    """
+
+    def __init__(self, flows: Mapping[str, FlowDeformation]) -> None:
+        super().__init__()
+        if not flows:
+            raise ValueError("flows must be at least one, got none")
+        for name, flow in flows.items():
+            if not isinstance(flow, FlowDeformation):
+                raise ValueError(f"flows must be FlowDeformation, got {type(flow).__name__} for {name}")
+        self.flows = nn.ModuleDict(flows)
+
+    def _links(self) -> list[FlowDeformation]:
+        return [cast(FlowDeformation, flow) for flow in self.flows.values()]
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Canonical positions (..., 3) of world positions (..., 3) at times (...,); raises as the flows do."""
+        for flow in self._links():
+            positions = flow(positions, times)
+        return positions
+
+    def inverse(self, canonical: Tensor, times: Tensor) -> Tensor:
+        """World positions (..., 3) at times (...,) of canonical positions (..., 3); raises as the flows do."""
+        for flow in reversed(self._links()):
+            canonical = flow.inverse(canonical, times)
+        return canonical
+
+    def reverse(self, canonical: Tensor, times: Tensor) -> Tensor:
+        """See `FlowDeformation.reverse`."""
+        for flow in reversed(self._links()):
+            canonical = flow.reverse(canonical, times)
+        return canonical

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import check_choice, check_positive
+from dnerf.core.checks import check_choice, check_positive
 
 FIXED_SOLVERS = {"euler": 1, "midpoint": 2, "rk4": 4}
 """Evaluations per step, which is also the order of each."""
@@ -48,25 +48,15 @@ class Solver:
     """
 
     def __init__(
-        self,
-        name: str = "rk4",
-        num_steps: int = 8,
-        *,
-        rtol: float = 1e-5,
-        atol: float = 1e-6,
-        gradient: str = "direct",
-        max_steps: int = 1000,
-    ) -> None:
+        self, name: str = "rk4", num_steps: int = 8, *, rtol: float = 1e-5, atol: float = 1e-6,
+        gradient: str = "direct", max_steps: int = 1000,
+    ) -> None:  # fmt: skip
         check_choice("solver", name, SOLVERS)
         check_choice("gradient", gradient, GRADIENTS)
         for argument, value in (("num_steps", num_steps), ("rtol", rtol), ("atol", atol), ("max_steps", max_steps)):
             check_positive(argument, value)
-        self.name = name
-        self.num_steps = num_steps
-        self.rtol = rtol
-        self.atol = atol
-        self.gradient = gradient
-        self.max_steps = max_steps
+        self.name, self.num_steps, self.gradient = name, num_steps, gradient
+        self.rtol, self.atol, self.max_steps = rtol, atol, max_steps
 
     @property
     def is_adaptive(self) -> bool:
@@ -74,11 +64,7 @@ class Solver:
         return self.name in ADAPTIVE_SOLVERS
 
     def solve(self, right_hand_side: RightHandSide, positions: Tensor) -> Tensor:
-        """Positions (..., 3) at s = 1 of those at s = 0, by the direct gradient.
-
-        Raises:
-            AssertionError: by torchdiffeq, where an adaptive solver cannot go on.
-        """
+        """Positions (..., 3) at s = 1 of those at s = 0; torchdiffeq raises AssertionError where it cannot go on."""
         if not self.is_adaptive:
             return fixed_steps(self.name, right_hand_side, positions, self.num_steps)
         from torchdiffeq import odeint  # with it comes scipy, a fifth of a second that fixed steps need not wait for
@@ -149,22 +135,13 @@ def _worst_point(values: Tensor) -> Tensor:
 
 
 def failure(
-    solver: Solver,
-    reason: str,
-    right_hand_side: RightHandSide,
-    reached: tuple[float, Tensor],
-    start: Tensor,
+    solver: Solver, reason: str, right_hand_side: RightHandSide, reached: tuple[float, Tensor], start: Tensor,
     end: Tensor,
-) -> IntegrationError:
+) -> IntegrationError:  # fmt: skip
     """The error to raise for a failed integration, which names the worst point there and its time.
 
-    Args:
-        solver: that failed.
-        reason: what happened, in words.
-        right_hand_side: of the equation.
-        reached: s and positions (..., 3): of a fixed-step solver where it began, of an adaptive one where it stopped.
-        start: (...,) time at s = 0.
-        end: (...,) time at s = 1.
+    `reached` is s and positions (..., 3): of a fixed-step solver where it began, of an adaptive one where it stopped.
+    Points are on their way from times `start` to `end`, (...,) each.
     """
     s, x = reached
     with torch.no_grad():

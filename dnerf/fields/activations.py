@@ -6,14 +6,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from dnerf.checks import check_choice
+from dnerf.core.checks import check_choice
 
 DENSITY_ACTIVATIONS = ("softplus", "exp")
 
 
 class _TruncatedExp(torch.autograd.Function):
-    """exp clamped to e^15 in value, its gradient to e^15 as well, so that neither overflows (instant-ngp)."""
-
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         result = torch.exp(x.clamp(max=15.0))
@@ -27,7 +25,7 @@ class _TruncatedExp(torch.autograd.Function):
 
 
 def truncated_exp(x: Tensor) -> Tensor:
-    """exp(min(x, 15)) whose gradient keeps pulling beyond the clamp: d/dx = exp(min(x, 15)) everywhere."""
+    """exp(min(x, 15)), by which its gradient is clamped as well: neither overflows (instant-ngp)."""
     return _TruncatedExp.apply(x)
 
 

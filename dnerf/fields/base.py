@@ -1,14 +1,17 @@
 """What a radiance field is: density and colour at positions and times."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.compositing import FieldOutput
-from dnerf.rays import Rays
+from dnerf.core.compositing import FieldOutput
+from dnerf.core.rays import Rays
+from dnerf.core.shortcuts import speaks_for
+from dnerf.kernels import FrameTables, GridLevels, MarchGrid
 
-MOST_AT_ONCE = 1 << 17  # places that `ask_along` asks in one go: bounds the memory, in haze
+MOST_AT_ONCE = 1 << 17  # places that `evaluate_along_rays` evaluates in one go: bounds the memory
 PAD_TO = 2048  # places: matrix libraries compile code for every new number of rows
 
 
@@ -21,115 +24,91 @@ class RadianceField(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
-        """Density and colour.
+        """Density (...,) and rgb (..., 3) at positions and times as above.
 
-        Args:
-            positions: (..., 3) in world units.
-            directions: (..., 3) unit viewing directions, from the eye into the scene.
-            times: (...,) in [0, 1].
-
-        Returns:
-            `FieldOutput` with density (...,) and rgb (..., 3) in [0, 1].
+        Directions (..., 3) are unit vectors from the eye into the scene.
         """
-
-    def along(self, rays: Rays, ray_indices: Tensor, distances: Tensor) -> FieldOutput:
-        """What `forward` says at distances (N,) along the rays with numbers (N,) int64, perhaps without extras."""
-        return self(*rays.places(ray_indices, distances))
-
-    def _without_contents(self) -> ValueError:
-        return ValueError(f"{type(self).__name__} has no contents that say all about a place (num_contents is 0)")
-
-    def _check_contents(self, contents: Tensor, times: Tensor) -> None:
-        if not self.num_contents:
-            raise self._without_contents()
-        if contents.shape[-1:] != (self.num_contents,):
-            raise ValueError(f"contents must have shape (..., {self.num_contents}), got {tuple(contents.shape)}")
-        if times.ndim and times.shape != contents.shape[:-1]:
-            raise ValueError(
-                f"times must have shape () or {tuple(contents.shape[:-1])} as the contents, got {tuple(times.shape)}"
-            )
-
-    @property
-    def num_contents(self) -> int:
-        """How many numbers say all about a place, see `contents`; 0 if none do, as where directions matter."""
-        return 0
-
-    @property
-    def has_changes(self) -> bool:
-        """Whether contents say all but what `changes` adds to them; False for a field without contents."""
-        return False
-
-    def contents(self, positions: Tensor) -> Tensor:
-        """All that the field knows of positions (..., 3): numbers (..., C), about linear where the field is smooth.
-
-        All but `changes`, if it has any (`has_changes`).
-
-        Raises:
-            ValueError: for a field without such numbers (`num_contents` is 0), or positions of another shape.
-        """
-        raise self._without_contents()
-
-    def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
-        """What `forward` says of places, from their contents (..., C), at times (...,) or one time () for all.
-
-        Without `changes`, if it has any.
-
-        Raises:
-            ValueError: for a field without contents, or shapes that do not fit.
-        """
-        raise self._without_contents()
-
-    def series_at(self, time: float) -> tuple[Tensor, float] | None:
-        """How contents add up at a time in [0, 1], if they are 4 K terms of density, red, green and blue in turn.
-
-        Returns:
-            Factors w (K,) and a shift s such that density is `exp(min(w . terms + s, 15))` and a colour
-            `sigmoid(w . terms)`, `changes` added to the products; None for a field that shows its contents in another
-            way, or has none.
-        """
-        return None
-
-    def changes(self, positions: Tensor, times: Tensor) -> Tensor:
-        """What is added at positions (..., 3) and times (...,) to what terms sum up to, see `series_at`: (..., 4).
-
-        Raises:
-            ValueError: for a field of which contents say all, or that has none (`has_changes` is False).
-        """
-        raise ValueError(f"{type(self).__name__} has no changes beside its contents (has_changes is False)")
-
-    def finished(self) -> "RadianceField":
-        """The field to ask once nothing is learnt any more; itself, unless something can be kept between frames."""
-        return self
 
     def at_time(self, time: float, extent: Tensor | None = None) -> "RadianceField":
-        """The field to ask while a frame of one time is rendered; itself, unless something can be kept for it.
+        """A field for one frame, perhaps cheaper to evaluate, at this time alone; itself unless overridden.
 
-        Args:
-            time: in [0, 1]; what is returned may be asked at no other.
-            extent: (2, 3) box in world units beyond which it will hardly be asked, if that is known.
+        The extent is a box (2, 3) beyond which it will hardly be evaluated, if that is known.
         """
         return self
 
 
-def ask_along(
+class TimeDependence(ABC):
+    """A field that says whether it changes with time; of other fields that is unknown."""
+
+    @property
+    @abstractmethod
+    def is_static(self) -> bool:
+        """Whether density and colour are the same at all times."""
+
+
+@dataclass(frozen=True)
+class NetworkTables:
+    """A canonical field at one time as the fused frame kernel reads it, see `dnerf.kernels.trace_network`."""
+
+    low: Tensor  # (3,) lowest corner of the feature grid's box, in canonical space
+    scale: Tensor  # (3,) one by its sides
+    table: Tensor  # (T, F) features
+    levels: GridLevels  # resolutions and table layout
+    weights: list[Tensor]  # of each layer, (out_features, in_features)
+    biases: list[Tensor]  # of each layer, (out_features,)
+    shifts: Tensor  # (4,) added to the outputs: the logarithm of density, then red, green and blue before a sigmoid
+
+
+class NetworkTabled(ABC):
+    """A field, of one time, that is a small network on grid features: the fused frame kernel can evaluate it."""
+
+    @abstractmethod
+    def network_tables(self) -> NetworkTables | None:
+        """Its tables, detached; None where they are not all that it shows."""
+
+
+class FrameTabled(ABC):
+    """A field, of one time, that the fused frame kernel can render, see `dnerf.kernels.trace_network`."""
+
+    @abstractmethod
+    def frame_tables(self, grid: MarchGrid, num_rays: int) -> FrameTables | None:
+        """What the kernel reads for so many rays; None if it does not serve such a field in the precision and on the
+        processor of now. The grid holds the occupied cells of that time."""
+
+
+class AlongRays(ABC):
+    """A field that is evaluated more cheaply where positions are given as distances along rays."""
+
+    @abstractmethod
+    def along_rays(self, rays: Rays, ray_indices: Tensor, distances: Tensor) -> FieldOutput:
+        """What `forward` gives at distances (N,) along the rays with numbers (N,) int64, without extras."""
+
+
+def field_at_time(field: RadianceField, time: float, extent: Tensor | None = None) -> RadianceField:
+    """`field.at_time`, unless a subclass has another `forward` or `density` than the class that wrote it."""
+    return field.at_time(time, extent) if speaks_for(field, "at_time", "forward", "density") else field
+
+
+def evaluate_along_rays(
     field: RadianceField, rays: Rays, ray_indices: Tensor, distances: Tensor, *, pad_to: int = PAD_TO
 ) -> FieldOutput:
-    """Density (N,) and rgb (N, 3) of a field along rays, at most `MOST_AT_ONCE` places at a time, without extras.
+    """Density (N,) and rgb (N, 3) of a field at distances (N,) along the rays with numbers (N,) int64, without extras.
 
-    Args:
-        field: what is asked.
-        rays: R rays.
-        ray_indices: (N,) int64, the ray of each place.
-        distances: (N,) along it, in world units.
-        pad_to: a multiple of so many places is asked.
+    At most `MOST_AT_ONCE` places at a time; a multiple of `pad_to` is evaluated.
     """
     count = len(distances)
     padding = -count % pad_to if count else 0
     if padding:
         ray_indices, distances = (torch.cat([x, x[-1:].expand(padding)]) for x in (ray_indices, distances))
     parts = [
-        field.along(rays, *part)
+        _evaluated(field, rays, *part)
         for part in zip(ray_indices.split(MOST_AT_ONCE), distances.split(MOST_AT_ONCE), strict=True)
     ]
     density, rgb = (torch.cat(x) if len(x) > 1 else x[0] for x in zip(*((p.density, p.rgb) for p in parts)))
     return FieldOutput(density[:count], rgb[:count])
+
+
+def _evaluated(field: RadianceField, rays: Rays, ray_indices: Tensor, distances: Tensor) -> FieldOutput:
+    if isinstance(field, AlongRays) and speaks_for(field, "along_rays", "forward"):
+        return field.along_rays(rays, ray_indices, distances)
+    return field(*rays.places(ray_indices, distances))

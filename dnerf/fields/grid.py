@@ -2,29 +2,30 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import as_box, check_positive, check_shape, check_whole
-from dnerf.compositing import FieldOutput
+from dnerf.core.checks import as_box, check_positive, check_shape, check_whole
+from dnerf.core.compositing import FieldOutput
+from dnerf.core.schedules import Scheduled
 from dnerf.deformations.base import check_one_time, check_positions_times
-from dnerf.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
 from dnerf.fields.activations import activate_density
-from dnerf.fields.base import RadianceField
+from dnerf.fields.base import NetworkTabled, NetworkTables, RadianceField, TimeDependence
 from dnerf.fields.space_time import SpaceTimeVolumes
-from dnerf.geometry import check_last_axis
 from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, shade
-from dnerf.mlp import MLP
+from dnerf.nn.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
+from dnerf.nn.mlp import MLP
+from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
 
-class GridField(RadianceField):
+class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
     """Features interpolated in grids of several resolutions, then a small MLP for density and colour.
 
     Source: instant-ngp (Mueller et al. 2022): levels are dense while their vertices fit into `max_rows` rows and
     hashed beyond. Cells are cubes: a resolution counts cells along the box's longest side. Parts a scene does not
-    need do not exist: no change with time without `time_terms` or `space_time`, no directions without `view_degree`.
+    need do not exist: no change with time without `temporal_terms` or `space_time`, no directions without
+    `view_degree`.
 
     Args:
         box: (2, 3) corners of the modelled space; positions outside see the features of the nearest face.
@@ -34,7 +35,7 @@ class GridField(RadianceField):
         hidden_features: width of the head.
         num_layers: hidden layers of the head.
         time_frequencies: octaves of a time encoding that the head sees; None for a head that does not depend on time.
-        time_terms: terms K of a cosine series in time, cos(k pi t) for k < K, that density and colour follow before
+        temporal_terms: terms K of a cosine series in time, cos(k pi t) for k < K, that density and colour follow before
             their activations: folds and shading that change while matter moves. 1 for matter that is carried along
             and never changes.
         space_time: features of place and time that the head sees, too: for what moves too fast, or in too many ways,
@@ -51,25 +52,14 @@ class GridField(RadianceField):
     """
 
     def __init__(
-        self,
-        box: Sequence[Sequence[float]],
-        resolutions: Sequence[int] = (16, 32, 64, 128),
-        num_features: int = 8,
-        *,
-        max_rows: int = 1 << 17,
-        hidden_features: int = 64,
-        num_layers: int = 2,
-        time_frequencies: int | None = None,
-        time_terms: int = 1,
-        space_time: SpaceTimeVolumes | None = None,
-        view_degree: int | None = None,
-        density_activation: str = "exp",
-        density_shift: float = -1.0,
-        window_end: float | None = None,
-    ) -> None:
+        self, box: Sequence[Sequence[float]], resolutions: Sequence[int] = (16, 32, 64, 128), num_features: int = 8, *,
+        max_rows: int = 1 << 17, hidden_features: int = 64, num_layers: int = 2, time_frequencies: int | None = None,
+        temporal_terms: int = 1, space_time: SpaceTimeVolumes | None = None, view_degree: int | None = None,
+        density_activation: str = "exp", density_shift: float = -1.0, window_end: float | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         check_positive("num_features", num_features)
-        check_positive("time_terms", time_terms)
+        check_positive("temporal_terms", temporal_terms)
         if window_end is not None and not 0 < window_end <= 1:
             raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
         for resolution in resolutions:
@@ -82,48 +72,43 @@ class GridField(RadianceField):
         self.density_shift = density_shift
         self.window_end = window_end
         levels = torch.arange(self.levels.num_levels)
-        self.register_buffer("window", (levels == 0).float(), persistent=window_end is not None)
-        self.window: Tensor
-        self.register_buffer("low", corners[0], persistent=False)
-        self.register_buffer("scale", 1 / sides, persistent=False)
-        self.low: Tensor
-        self.scale: Tensor
+        self.window = nn.Buffer((levels == 0).float(), persistent=window_end is not None)
+        self.low = nn.Buffer(corners[0], persistent=False)
+        self.scale = nn.Buffer(1 / sides, persistent=False)
         self.table = nn.Parameter(torch.empty(self.levels.num_rows, num_features).uniform_(-1e-2, 1e-2))
         self.encode_times = None if time_frequencies is None else SinusoidalEncoding(1, time_frequencies)
         self.encode_directions = None if view_degree is None else SphericalHarmonicsEncoding(view_degree)
         self.space_time = space_time
-        self.time_terms = time_terms
-        self.register_buffer("orders", torch.arange(time_terms), persistent=False)
-        self.orders: Tensor
+        self.temporal_terms = temporal_terms
+        self.orders = nn.Buffer(torch.arange(temporal_terms), persistent=False)
         in_features = num_features * self.levels.num_levels
         if self.encode_times is not None:
             in_features += self.encode_times.out_features
         if space_time is not None:
             in_features += space_time.out_features
         if self.encode_directions is None:
-            self.head = MLP(in_features, hidden_features, num_layers, out_features=4 * time_terms)
-            _begin_constant(self.head, 4, time_terms)
+            self.head = MLP(in_features, hidden_features, num_layers, out_features=4 * temporal_terms)
+            _begin_constant(self.head, 4, temporal_terms)
         else:
-            self.head = MLP(in_features, hidden_features, num_layers, out_features=time_terms + hidden_features)
-            _begin_constant(self.head, 1, time_terms)
+            self.head = MLP(in_features, hidden_features, num_layers, out_features=temporal_terms + hidden_features)
+            _begin_constant(self.head, 1, temporal_terms)
             in_colors = hidden_features + self.encode_directions.out_features
-            self.to_rgb = MLP(in_colors, hidden_features, 1, out_features=3 * time_terms)
-            _begin_constant(self.to_rgb, 3, time_terms)
+            self.to_rgb = MLP(in_colors, hidden_features, 1, out_features=3 * temporal_terms)
+            _begin_constant(self.to_rgb, 3, temporal_terms)
 
     @property
-    def num_contents(self) -> int:
-        """The head's outputs; none if it sees times, but for `space_time`'s, or directions."""
-        sees_more = self.encode_times is not None or self.encode_directions is not None
-        return 0 if sees_more else 4 * self.time_terms
+    def _is_series(self) -> bool:
+        """Whether the head's outputs are all there is: it sees neither times, nor directions."""
+        return self.encode_times is None and self.encode_directions is None
 
     @property
-    def has_changes(self) -> bool:
-        """Whether the head sees `space_time`, beside contents."""
-        return self._sees_space_time and self.num_contents > 0
+    def is_static(self) -> bool:
+        """Whether neither the head nor its series sees times."""
+        return self.encode_times is None and self.space_time is None and self.temporal_terms == 1
 
-    @property
-    def _sees_space_time(self) -> bool:
-        return self.space_time is not None and self.space_time.has_joined
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """The networks in "head"; features, which wait long for their turn, are left in "default"."""
+        return [ParameterGroup("head", tuple(self.head.parameters()))]
 
     def set_progress(self, progress: float) -> None:
         """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
@@ -142,38 +127,35 @@ class GridField(RadianceField):
         """Of each of the table's features; None for 1."""
         return None if self.window_end is None else self.window.repeat_interleave(self.table.shape[1])
 
-    def _inputs(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """What the head sees (..., n), and the scale (n,) of each column; without times, that without `space_time`."""
+    def _inputs(self, positions: Tensor, times: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What the head sees (..., n), and the scale (n,) of each column."""
         features = grid_encode(self._unit(positions), self.table, self.levels, rounded=is_bfloat16_wanted(positions))
         features = features.reshape(*positions.shape[:-1], features.shape[-1])
         scale = self._feature_scale
         if self.encode_times is not None:
-            assert times is not None
             features, scale = _joined(features, scale, self.encode_times(times[..., None]))
-        if times is None or not self._sees_space_time:
-            return features, scale
-        assert self.space_time is not None
-        return _joined(features, scale, self.space_time(positions, times))
+        if self.space_time is not None:
+            features, scale = _joined(features, scale, self.space_time(positions, times))
+        return features, scale
 
-    def _linear(self, positions: Tensor, times: Tensor | None, weight: Tensor, bias: Tensor) -> Tensor:
-        """What a linear layer makes of what the head's last one sees; without times, of that without `space_time`."""
-        is_grid_all = self.encode_times is None and (times is None or not self._sees_space_time)
-        layers = self._grid_layers() if is_grid_all and not torch.is_grad_enabled() else None
+    def _linear(self, positions: Tensor, times: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """What a linear layer makes of what the head's last one sees."""
+        layers = None if torch.is_grad_enabled() else self._grid_layers()
         if layers is not None:
             weights, biases = [*layers[0], weight], [*layers[1], bias]
             values = grid_network(self._unit(positions), self.table, self.levels, weights, biases)
             return values.reshape(*positions.shape[:-1], len(bias))
-        features, scale = self._inputs(positions, times)
-        seen = self.head.before_output(features, scale, num_lacking=self.head.in_features - features.shape[-1])
+        seen = self.head.before_output(*self._inputs(positions, times))
         return nn.functional.linear(seen, weight, bias)
 
     def _grid_layers(self) -> tuple[list[Tensor], list[Tensor]] | None:
-        """Weights and biases of the head's hidden layers that see the table's features, see `MLP.relu_parameters`."""
-        num_lacking = self.head.in_features - self.levels.num_levels * self.table.shape[1]
-        return self.head.relu_parameters(self._feature_scale, num_lacking=num_lacking)
+        """Weights and biases of the head's hidden layers, if they see the table's features and nothing else."""
+        if self.encode_times is not None or self.space_time is not None:
+            return None
+        return self.head.relu_parameters(self._feature_scale)
 
-    def _raw(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """The head's outputs; without times, those without `space_time`."""
+    def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
+        """The head's outputs."""
         assert self.head.output is not None
         return self._linear(positions, times, self.head.output.weight, self.head.output.bias)
 
@@ -182,11 +164,11 @@ class GridField(RadianceField):
 
     def _at(self, series: Tensor, times: Tensor) -> Tensor:
         """Values (..., n) of series (..., n K) at times (...,), or at one time ()."""
-        if self.time_terms == 1:
+        if self.temporal_terms == 1:
             return series
         dtype = torch.promote_types(torch.promote_types(series.dtype, times.dtype), torch.float32)
         waves = self._waves(times.to(dtype))
-        terms = series.to(dtype).unflatten(-1, (-1, self.time_terms))
+        terms = series.to(dtype).unflatten(-1, (-1, self.temporal_terms))
         if times.ndim:
             return (terms * waves[..., None, :]).sum(-1)
         with torch.autocast(terms.device.type, enabled=False):
@@ -196,42 +178,9 @@ class GridField(RadianceField):
         """The series' cosines (..., K) at times (...,)."""
         return torch.cos(math.pi * self.orders.to(times.dtype) * times[..., None])
 
-    def series_at(self, time: float) -> tuple[Tensor, float] | None:
-        """Its cosines and `density_shift`; None if the density is no exponential."""
-        if not self.num_contents or self.density_activation != "exp":
-            return None
-        return self._waves(torch.tensor(time, device=self.orders.device)), self.density_shift
-
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
         """The same with its series summed up, if it sees no directions."""
-        return GridFieldAtTime(self, time) if self.num_contents else self
-
-    def contents(self, positions: Tensor) -> Tensor:
-        """The head's outputs (..., 4 K) at canonical positions (..., 3), `space_time` unseen."""
-        if not self.num_contents:
-            raise self._without_contents()
-        check_last_axis("positions", positions, 3)
-        return self._raw(positions, None)
-
-    def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
-        """Density (...,) and rgb (..., 3) of the head's outputs (..., 4 K) at times (...,), or at one time ()."""
-        self._check_contents(contents, times)
-        return self._shown(contents, times)
-
-    def changes(self, positions: Tensor, times: Tensor) -> Tensor:
-        """What `space_time` adds at canonical positions (..., 3) and times (...,) to density and colour, before their
-        activations: (..., 4)."""
-        if not self.has_changes:
-            return super().changes(positions, times)
-        check_positions_times(positions, times)
-        assert self.space_time is not None
-        features, scale = self._inputs(positions, None)
-        with_it = self.head(*_joined(features, scale, self.space_time(positions, times)))
-        without = self.head(features, scale, num_lacking=self.space_time.out_features)
-        return self._at(with_it, times) - self._at(without, times)
-
-    def _shown(self, series: Tensor, times: Tensor) -> FieldOutput:
-        return self._activated_values(self._at(series, times))
+        return GridFieldAtTime(self, time) if self._is_series else self
 
     def _activated_values(self, values: Tensor) -> FieldOutput:
         values = values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
@@ -241,57 +190,55 @@ class GridField(RadianceField):
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
-        return self._activated(self._at(self._raw(positions, times)[..., : self.time_terms], times)[..., 0])
+        return self._activated(self._at(self._raw(positions, times)[..., : self.temporal_terms], times)[..., 0])
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3), directions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
         raw = self._raw(positions, times)
         if self.encode_directions is None:
-            return self._shown(raw, times)
+            return self._activated_values(self._at(raw, times))
         check_shape("directions", directions, positions.shape)
-        features = torch.relu(raw[..., self.time_terms :])
+        features = torch.relu(raw[..., self.temporal_terms :])
         colors = self.to_rgb(torch.cat([features, self.encode_directions(directions)], dim=-1))
-        return self._shown(torch.cat([raw[..., : self.time_terms], colors], dim=-1), times)
+        return self._activated_values(self._at(torch.cat([raw[..., : self.temporal_terms], colors], dim=-1), times))
 
 
-class GridFieldAtTime(RadianceField):
-    """A grid field at one time, for pictures: its series are summed up in the head's last layer, not at every sample.
+class GridFieldAtTime(RadianceField, NetworkTabled):
+    """A grid field at one time, for images: its series are summed up in the head's last layer, not at every sample.
 
     Args:
-        field: what is asked, with contents that change with time; `space_time` is seen.
-        time: in [0, 1]; the only one at which it may be asked.
+        field: what is evaluated; its head sees neither times nor directions.
+        time: in [0, 1]; the only one at which it may be evaluated.
 
     Raises:
-        ValueError: for a field without contents; when asked, for other times.
+        ValueError: for another field; when evaluated, for other times.
     """
 
     def __init__(self, field: GridField, time: float) -> None:
         super().__init__()
         last = field.head.output
-        if not field.num_contents or last is None:
-            raise ValueError("field must have contents, got one whose head sees times or directions")
+        if not field._is_series or last is None:
+            raise ValueError("field must be one whose head sees neither times nor directions")
         waves = field._waves(field.low.new_tensor(time)).to(last.weight.dtype)
         self.field = field
         self.time = time
         with torch.autocast(waves.device.type, enabled=False):
             weight = torch.einsum("ckh,k->ch", last.weight.detach().unflatten(0, (4, -1)), waves)
             bias = last.bias.detach().unflatten(0, (4, -1)) @ waves
-        self.register_buffer("weight", weight)
-        self.register_buffer("bias", bias)
-        self.weight: Tensor
-        self.bias: Tensor
+        self.weight = nn.Buffer(weight)
+        self.bias = nn.Buffer(bias)
 
-    def tables(self) -> dict[str, Any] | None:
-        """What `dnerf.kernels.NetworkTables` have to know of it; None where it is not all that it shows."""
+    def network_tables(self) -> NetworkTables | None:
+        """Its tables; None for another density than the exponential one, or with features of space and time."""
         field, layers = self.field, self.field._grid_layers()
-        if layers is None or field.density_activation != "exp" or field._sees_space_time:
+        if layers is None or field.density_activation != "exp":
             return None
-        return {
-            "field_low": field.low, "field_scale": field.scale, "table": field.table, "levels": field.levels,
-            "weights": [*layers[0], self.weight], "biases": [*layers[1], torch.zeros_like(self.bias)],
-            "shifts": self.bias + self.bias.new_tensor([field.density_shift, 0, 0, 0]),
-        }  # fmt: skip
+        return NetworkTables(
+            low=field.low, scale=field.scale, table=field.table.detach(), levels=field.levels,
+            weights=[*layers[0], self.weight], biases=[*layers[1], torch.zeros_like(self.bias)],
+            shifts=self.bias + self.bias.new_tensor([field.density_shift, 0, 0, 0]),
+        )  # fmt: skip
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""

@@ -5,17 +5,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import check_positive, check_shape
-from dnerf.compositing import FieldOutput
+from dnerf.core.checks import check_positive, check_shape
+from dnerf.core.compositing import FieldOutput
 from dnerf.deformations.base import check_positions_times
-from dnerf.encodings import SinusoidalEncoding
 from dnerf.fields.activations import activate_density
-from dnerf.fields.base import RadianceField
-from dnerf.geometry import check_last_axis
-from dnerf.mlp import MLP
+from dnerf.fields.base import RadianceField, TimeDependence
+from dnerf.nn.encodings import SinusoidalEncoding
+from dnerf.nn.mlp import MLP
 
 
-class NeRFField(RadianceField):
+class NeRFField(RadianceField, TimeDependence):
     """NeRF's network: an MLP of the encoded position gives density and features, a small head the colour.
 
     Source: NeRF (arXiv 2003.08934) section 3 and appendix A. Deviations: the density activation is a shifted
@@ -37,17 +36,10 @@ class NeRFField(RadianceField):
     """
 
     def __init__(
-        self,
-        num_layers: int = 8,
-        hidden_features: int = 256,
-        skips: Sequence[int] = (5,),
-        *,
-        position_frequencies: int = 10,
-        view_dependent: bool = False,
-        direction_frequencies: int = 4,
-        density_activation: str = "softplus",
-        density_shift: float = -1.0,
-    ) -> None:
+        self, num_layers: int = 8, hidden_features: int = 256, skips: Sequence[int] = (5,), *,
+        position_frequencies: int = 10, view_dependent: bool = False, direction_frequencies: int = 4,
+        density_activation: str = "softplus", density_shift: float = -1.0,
+    ) -> None:  # fmt: skip
         super().__init__()
         check_positive("num_layers", num_layers)
         self.density_activation = density_activation
@@ -64,30 +56,13 @@ class NeRFField(RadianceField):
         else:
             self.to_rgb = nn.Linear(hidden_features, 3)
 
-    @property
-    def num_contents(self) -> int:
-        """Density and colour before their activations; none if colour depends on the direction."""
-        return 4 if self.encode_directions is None else 0
-
-    def contents(self, positions: Tensor) -> Tensor:
-        """Density and colour before their activations (..., 4) at canonical positions (..., 3)."""
-        if self.encode_directions is not None:
-            raise self._without_contents()
-        check_last_axis("positions", positions, 3)
-        features = self.trunk(self.encode_positions(positions))
-        return torch.cat([self.to_density(features), self.to_rgb(features)], dim=-1)
-
-    def from_contents(self, contents: Tensor, times: Tensor) -> FieldOutput:
-        """Density (...,) and rgb (..., 3) of contents (..., 4); times are not used."""
-        self._check_contents(contents, times)
-        density = self._activated(contents[..., 0])
-        return FieldOutput(density=density, rgb=torch.sigmoid(contents[..., 1:].to(density.dtype)))
-
-    def _activated(self, raw: Tensor) -> Tensor:
-        return activate_density(raw, self.density_activation, self.density_shift)
-
     def _density(self, features: Tensor) -> Tensor:
-        return self._activated(self.to_density(features)[..., 0])
+        return activate_density(self.to_density(features)[..., 0], self.density_activation, self.density_shift)
+
+    @property
+    def is_static(self) -> bool:
+        """Always: times are not used."""
+        return True
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3); times (...,) are not used."""
@@ -97,10 +72,9 @@ class NeRFField(RadianceField):
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3) seen along directions (..., 3)."""
         check_positions_times(positions, times)
-        if self.encode_directions is None:
-            return self.from_contents(self.contents(positions), times)
-        check_shape("directions", directions, positions.shape)
         features = self.trunk(self.encode_positions(positions))
         density = self._density(features)
-        features = torch.cat([self.features(features), self.encode_directions(directions)], dim=-1)
+        if self.encode_directions is not None:
+            check_shape("directions", directions, positions.shape)
+            features = torch.cat([self.features(features), self.encode_directions(directions)], dim=-1)
         return FieldOutput(density=density, rgb=torch.sigmoid(self.to_rgb(features).to(density.dtype)))

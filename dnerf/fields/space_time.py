@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import as_box, check_positive
+from dnerf.core.checks import as_box, check_positive
 from dnerf.deformations.base import check_positions_times
 from dnerf.kernels import GridLevels, grid_encode
 
@@ -27,21 +27,15 @@ class SpaceTimeVolumes(nn.Module):
         resolutions: cells along the box's longest side, per level.
         time_resolutions: cells along time, per level.
         num_features: features per level, F.
-        waits: whether they say nothing, and cost nothing, until they are let in by `join`.
 
     Raises:
         ValueError: for a box or sizes out of range, or levels of which one list has more.
     """
 
     def __init__(
-        self,
-        box: Sequence[Sequence[float]],
-        resolutions: Sequence[int] = (24, 48),
-        time_resolutions: Sequence[int] = (25, 50),
-        *,
-        num_features: int = 4,
-        waits: bool = False,
-    ) -> None:
+        self, box: Sequence[Sequence[float]], resolutions: Sequence[int] = (24, 48),
+        time_resolutions: Sequence[int] = (25, 50), *, num_features: int = 4,
+    ) -> None:  # fmt: skip
         super().__init__()
         check_positive("num_features", num_features)
         if len(resolutions) != len(time_resolutions):
@@ -59,37 +53,14 @@ class SpaceTimeVolumes(nn.Module):
         self.tables = nn.ParameterList(
             nn.Parameter(torch.empty(levels.num_rows, num_features).uniform_(-1e-2, 1e-2)) for levels in self.levels
         )
-        self.register_buffer("low", corners[0], persistent=False)
-        self.register_buffer("scale", 1 / sides, persistent=False)
-        self.low: Tensor
-        self.scale: Tensor
+        self.low = nn.Buffer(corners[0], persistent=False)
+        self.scale = nn.Buffer(1 / sides, persistent=False)
         self.out_features = len(resolutions) * num_features
-        self.register_buffer("joined", torch.tensor(not waits), persistent=waits)
-        self.joined: Tensor
-        self._recall()
-        self.register_load_state_dict_post_hook(lambda module, _: module._recall())
-
-    def _recall(self) -> None:
-        """See whether the wait is over."""
-        self.joined = self.joined.clone()  # elsewhere in memory: recorded graphs of the model may be out of date
-        self._has_joined = bool(self.joined)
-
-    @property
-    def has_joined(self) -> bool:
-        """Whether they are in use; without waiting for a device."""
-        return self._has_joined
-
-    def join(self) -> None:
-        """End the wait."""
-        self.joined.fill_(True)
-        self._recall()
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Features (..., L F), level by level, at positions (..., 3) and times (...,) in [0, 1]; 0 while they wait."""
+        """Features (..., L F), level by level, at positions (..., 3) and times (...,) in [0, 1]."""
         check_positions_times(positions, times)
         dtype = positions.dtype
-        if not self.has_joined:
-            return positions.new_zeros(*times.shape, self.out_features)
         unit = ((positions - self.low.to(dtype)) * self.scale.to(dtype)).reshape(-1, 3)
         columns = [*unit.unbind(-1), times.to(dtype).reshape(-1)]
         a, b, c = (
@@ -110,7 +81,7 @@ class SpaceTimeVolumes(nn.Module):
 
 
 def _mean_square(values: Tensor) -> Tensor:
-    """0 for none, as of second differences between two moments."""
+    """0 for none, as of second differences between two times."""
     return values.square().sum() / max(values.numel(), 1)
 
 

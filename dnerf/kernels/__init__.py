@@ -2,7 +2,6 @@
 
 from .add_seen import add_seen
 from .backend import BACKENDS, get_backend, set_backend, use_backend
-from .brick_lookup import brick_lookup
 from .covered_places import covered_places
 from .few_nonzero import few_nonzero
 from .footprints import Footprints, footprints
@@ -18,39 +17,11 @@ from .seen_parts import SeenParts, seen_parts
 from .shade import shade
 from .skip_distances import skip_distances
 from .thin_out import thin_out
-from .trace import FrameTables, trace
-from .trace_network import NetworkTables, trace_network
+from .trace_network import FrameTables, is_traced, trace_network
 
 __all__ = [
-    "BACKENDS",
-    "Footprints",
-    "FrameTables",
-    "GridLevels",
-    "MarchGrid",
-    "MarchedSamples",
-    "NetworkTables",
-    "SeenParts",
-    "add_seen",
-    "brick_lookup",
-    "covered_places",
-    "few_nonzero",
-    "footprints",
-    "get_backend",
-    "grid_encode",
-    "grid_network",
-    "is_bfloat16_wanted",
-    "lattice_places",
-    "march",
-    "march_to_size",
-    "packed_sum",
-    "packed_weights",
-    "relu_layers",
-    "seen_parts",
-    "set_backend",
-    "shade",
-    "skip_distances",
-    "thin_out",
-    "trace",
-    "trace_network",
-    "use_backend",
-]
+    "BACKENDS", "Footprints", "FrameTables", "GridLevels", "MarchGrid", "MarchedSamples", "SeenParts", "add_seen",
+    "covered_places", "few_nonzero", "footprints", "get_backend", "grid_encode", "grid_network", "is_bfloat16_wanted",
+    "is_traced", "lattice_places", "march", "march_to_size", "packed_sum", "packed_weights", "relu_layers",
+    "seen_parts", "set_backend", "shade", "skip_distances", "thin_out", "trace_network", "use_backend",
+]  # fmt: skip

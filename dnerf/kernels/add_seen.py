@@ -3,27 +3,23 @@
 import torch
 from torch import Tensor
 
+from dnerf.core.checks import check_shape
+
 from .backend import choose, run_compiled
+from .checks import check_shapes
 from .packed_sum import packed_sum
-from .packed_weights import packed_weights
+from .packed_weights import MOST_DENSITY, packed_weights
 
 
 @torch.no_grad()
 def add_seen(
-    sums: Tensor,
-    rays: Tensor,
-    light: Tensor,
-    starts: Tensor,
-    ends: Tensor,
-    offsets: Tensor,
-    density: Tensor,
-    rgb: Tensor,
-    distances: Tensor | None = None,
-) -> Tensor:
+    sums: Tensor, rays: Tensor, light: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, density: Tensor,
+    rgb: Tensor, distances: Tensor | None = None,
+) -> Tensor:  # fmt: skip
     """Add what rays show of further samples to `sums`, and say how much light passes these.
 
-    Not differentiable: for pictures, of which a ray's samples come in rounds; `dnerf.compositing.composite` is for all
-    else.
+    Not differentiable: for images, of which a ray's samples come in rounds; `dnerf.core.compositing.composite` is for
+    all else.
 
     Args:
         sums: (T, 5) red, green, blue, distance times opacity, and opacity; changed in place.
@@ -43,13 +39,10 @@ def add_seen(
             or rays that are no rows.
     """
     count, num_rays = len(starts), len(rays)
-    shapes = {"sums": (sums, (len(sums), 5)), "light": (light, (num_rays,)), "offsets": (offsets, (num_rays + 1,))}
-    shapes |= {"ends": (ends, (count,)), "density": (density, (count,)), "rgb": (rgb, (count, 3))}
+    check_shapes(sums=(sums, (len(sums), 5)), light=(light, (num_rays,)), offsets=(offsets, (num_rays + 1,)))
+    check_shapes(ends=(ends, (count,)), density=(density, (count,)), rgb=(rgb, (count, 3)))
     if distances is not None:
-        shapes["distances"] = distances, (count,)
-    for name, (tensor, shape) in shapes.items():
-        if tensor.shape != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
+        check_shape("distances", distances, (count,))
     arguments = (sums, rays, light, starts, ends, offsets, density, rgb, distances)
     is_single = all(x is None or x.dtype in (torch.float32, torch.int64) for x in arguments)
     if is_single and sums.is_contiguous() and choose(sums) == "numba":
@@ -58,20 +51,13 @@ def add_seen(
 
 
 def add_seen_reference(
-    sums: Tensor,
-    rays: Tensor,
-    light: Tensor,
-    starts: Tensor,
-    ends: Tensor,
-    offsets: Tensor,
-    density: Tensor,
-    rgb: Tensor,
-    distances: Tensor | None,
-) -> Tensor:
+    sums: Tensor, rays: Tensor, light: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, density: Tensor,
+    rgb: Tensor, distances: Tensor | None,
+) -> Tensor:  # fmt: skip
     """The definition of `add_seen` in plain torch, but for what has kernels of its own."""
     distances = 0.5 * (starts + ends) if distances is None else distances
     columns = torch.cat([rgb, distances[:, None], torch.ones_like(distances)[:, None]], dim=-1)
-    seen = packed_sum(columns, packed_weights(density * (ends - starts), offsets), offsets)
+    seen = packed_sum(columns, packed_weights(density.clamp(max=MOST_DENSITY) * (ends - starts), offsets), offsets)
     seen[:, 4].clamp_(max=1)
     sums.index_add_(0, rays, (light[:, None] * seen).to(sums.dtype))
     return 1 - seen[:, 4]

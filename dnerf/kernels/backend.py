@@ -4,6 +4,7 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -17,10 +18,6 @@ COMPILED_DTYPES = (torch.float32, torch.float64)
 # would not reach. The name is checked where it is used, so that a misspelt variable does not break the import.
 _selected = os.environ.get("DNERF_KERNELS", "auto")
 
-# Asked once, and not in a function that torch.compile would have to see through: marking one as constant loads all of
-# its compiler, most of a second.
-_HAS_TRITON = importlib.util.find_spec("triton") is not None
-
 
 def get_backend() -> str:
     """The selected backend's name, one of `BACKENDS`."""
@@ -30,8 +27,8 @@ def get_backend() -> str:
 def set_backend(name: str) -> None:
     """Select the implementation that every kernel uses from now on, in this process.
 
-    `"auto"` takes Triton for CUDA tensors where it is installed, numba for CPU tensors, and the reference
-    otherwise. The environment variable `DNERF_KERNELS` gives the initial choice.
+    `"auto"` takes Triton for CUDA tensors where it is installed, numba for CPU tensors, and the reference otherwise.
+    The environment variable `DNERF_KERNELS` gives the initial choice.
 
     Args:
         name: one of `BACKENDS`. `"reference"` is differentiable to any order; the others once.
@@ -86,9 +83,10 @@ def run_compiled(op: str, function: str, tensor: Tensor, *arguments: Any) -> Any
     return getattr(import_module(f"dnerf.kernels.{folder}.{op}"), function)(tensor, *arguments)
 
 
+@cache
 def has_triton() -> bool:
     """Whether Triton can be imported."""
-    return _HAS_TRITON
+    return importlib.util.find_spec("triton") is not None
 
 
 def _check_name(name: str) -> None:

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from .backend import choose, run_compiled
-
-MOST_AXES = 3
+from .checks import check_shapes
 
 
 @torch.no_grad()
@@ -16,9 +15,9 @@ def covered_places(lows: Tensor, ends: Tensor, shape: Sequence[int]) -> Tensor:
     """Flat places of a raster that boxes cover; what reaches beyond it is cut off.
 
     Args:
-        lows: (D, M) int64, where each of M boxes begins on each of the raster's axes, D from 1 to 3.
-        ends: (D, M) int64, the first place behind it; a box that ends where it begins, or before, holds nothing.
-        shape: of the raster, D sizes.
+        lows: (3, M) int64, where each of M boxes begins on each of the raster's axes.
+        ends: (3, M) int64, the first place behind it; a box that ends where it begins, or before, holds nothing.
+        shape: of the raster, three sizes.
 
     Returns:
         (K,) int64, in order, each once.
@@ -27,13 +26,11 @@ def covered_places(lows: Tensor, ends: Tensor, shape: Sequence[int]) -> Tensor:
         ValueError: shapes or types that do not fit.
     """
     sizes = tuple(int(size) for size in shape)
-    if not 1 <= len(sizes) <= MOST_AXES or min(sizes) < 0:
-        raise ValueError(f"shape must be of 1 to {MOST_AXES} sizes, got {sizes}")
-    for name, corners in (("lows", lows), ("ends", ends)):
-        if corners.ndim != 2 or len(corners) != len(sizes) or corners.dtype != torch.int64:
-            raise ValueError(f"{name} must be ({len(sizes)}, M) int64, got {tuple(corners.shape)} {corners.dtype}")
-    if lows.shape != ends.shape:
-        raise ValueError(f"lows and ends must be of as many boxes, got {lows.shape[1]} and {ends.shape[1]}")
+    if len(sizes) != 3 or min(sizes) < 0:
+        raise ValueError(f"shape must be of three sizes, got {sizes}")
+    check_shapes(lows=(lows, (3, "M")), ends=(ends, (3, lows.shape[1])))
+    if not lows.dtype == ends.dtype == torch.int64:
+        raise ValueError(f"lows and ends must be int64, got {lows.dtype} and {ends.dtype}")
     if lows.is_cpu and choose(lows.new_empty(0, dtype=torch.float32)) == "numba":
         return run_compiled("covered_places", "covered_places", lows, ends, sizes)
     return covered_places_reference(lows, ends, sizes)
@@ -49,7 +46,7 @@ def covered_places_reference(lows: Tensor, ends: Tensor, shape: Sequence[int]) -
     has_some = (lows < ends).all(0)
     lows, ends = lows[:, has_some], ends[:, has_some]
     changes = torch.zeros([size + 1 for size in shape], dtype=torch.int64, device=lows.device)
-    for corner in product((False, True), repeat=len(shape)):
+    for corner in product((False, True), repeat=3):
         places = tuple(ends[axis] if is_end else lows[axis] for axis, is_end in enumerate(corner))
         changes.index_put_(places, lows.new_tensor((-1) ** sum(corner)), accumulate=True)
     for axis, size in enumerate(shape):

@@ -1,4 +1,4 @@
-"""Which pixels the cells of a grid cover on a picture, and how deep they lie behind each."""
+"""Which pixels the cells of a grid cover on an image, and how deep they lie behind each."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,15 +6,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dnerf.checks import check_shape
-from dnerf.geometry import cube_corners
+from dnerf.core.geometry import cube_corners
 
 from .backend import choose, run_compiled
+from .checks import check_cells, check_shapes
 from .few_nonzero import few_nonzero
 
 
 class Footprints(NamedTuple):
-    """P pixels of a picture that cells cover.
+    """P pixels of an image that cells cover.
 
     Attributes:
         pixels: (P,) int64, `row * width + column`, in order, each once.
@@ -29,7 +29,7 @@ class Footprints(NamedTuple):
 def footprints(
     occupancy: Tensor, aabb: Tensor, pose: Tensor, lens: Sequence[float], size: tuple[int, int]
 ) -> Footprints | None:
-    """Pixels inside the rectangles that span cells on a picture.
+    """Pixels inside the rectangles that span cells on an image.
 
     Cells are convex, so the rectangle around a cell's corners holds all of it, and the corners' depths bound its own.
 
@@ -39,7 +39,7 @@ def footprints(
         pose: (4, 4) camera-to-world, OpenGL axes.
         lens: focal lengths along x and y, column and row of the principal point, in pixels; rays of pixels go through
             whole numbers.
-        size: height and width of the picture in pixels.
+        size: height and width of the image in pixels.
 
     Returns:
         The pixels, or None if a cell does not lie before the camera.
@@ -47,9 +47,8 @@ def footprints(
     Raises:
         ValueError: shapes or types that do not fit.
     """
-    check_shape("occupancy", occupancy, ("Gx", "Gy", "Gz"))
-    check_shape("aabb", aabb, (2, 3))
-    check_shape("pose", pose, (4, 4))
+    check_cells("occupancy", occupancy, "Gx, Gy, Gz")
+    check_shapes(aabb=(aabb, (2, 3)), pose=(pose, (4, 4)))
     if len(lens) != 4 or len(size) != 2 or min(size) < 0:
         raise ValueError(f"lens must be four numbers and size two, not negative, got {tuple(lens)} and {tuple(size)}")
     places = few_nonzero(occupancy)
@@ -81,7 +80,7 @@ def footprints_reference(
     if not bool((depth > 0).all() & columns.isfinite().all() & rows.isfinite().all()):
         return None
     height, width = size
-    # Cut off while they are floats: what lies far beyond the picture may have no number.
+    # Cut off while they are floats: what lies far beyond the image may have no number.
     left, top = (p.amin(-1).floor().clamp(0, most).long() for p, most in ((columns, width), (rows, height)))
     right, bottom = (
         (p.amax(-1).ceil().clamp(min=-1) + 1).clamp(max=most).long() for p, most in ((columns, width), (rows, height))
@@ -93,10 +92,7 @@ def footprints_reference(
     pixels = (top[owner] + within // wide[owner]) * width + left[owner] + within % wide[owner]
     depths = [
         depth.new_full((height * width,), unseen).scatter_reduce_(0, pixels, extreme[owner], reduction)
-        for unseen, extreme, reduction in (
-            (torch.inf, depth.amin(-1), "amin"),
-            (-torch.inf, depth.amax(-1), "amax"),
-        )
+        for unseen, extreme, reduction in ((torch.inf, depth.amin(-1), "amin"), (-torch.inf, depth.amax(-1), "amax"))
     ]
     seen = depths[0].isfinite().nonzero()[:, 0]
     return Footprints(seen, torch.stack(depths)[:, seen])

@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .backend import choose, run_compiled
+from .backend import choose
+from .checks import check_shapes
 from .op import op
 
 HASH_PRIMES = (1, 2654435761, 805459861)
@@ -61,10 +63,7 @@ class GridLevels:
     @cached_property
     def offsets(self) -> tuple[int, ...]:
         """First row of every level in the table, and the total at the end: L + 1 ints."""
-        offsets = [0]
-        for v in self.vertices:
-            offsets.append(offsets[-1] + min(v, self.max_rows))
-        return tuple(offsets)
+        return tuple(accumulate((min(v, self.max_rows) for v in self.vertices), initial=0))
 
     @property
     def num_levels(self) -> int:
@@ -111,22 +110,15 @@ def grid_encode(positions: Tensor, table: Tensor, levels: GridLevels, *, rounded
         dtype = torch.promote_types(torch.promote_types(positions.dtype, table.dtype), torch.float32)
         positions, table = positions.to(dtype), table.to(dtype)
     rounded = rounded and positions.dtype == torch.float32 and not torch.is_grad_enabled()
-    backend = choose(positions)
-    if rounded and backend == "numba":
-        return torch.ops.dnerf.grid_encode_rounded(positions, table, levels.cells, levels.max_rows)
-    if backend == "reference":
-        features = grid_encode_reference(positions, table, levels)
-    else:
-        features = torch.ops.dnerf.grid_encode(positions, table, levels.cells, levels.max_rows)
+    if choose(positions) != "reference":
+        return _grid_encode(positions, table, levels.cells, levels.max_rows, rounded)
+    features = grid_encode_reference(positions, table, levels)
     return features.bfloat16() if rounded else features
 
 
 def check_grid(positions: Tensor, table: Tensor, levels: GridLevels) -> None:
     """Raise ValueError unless shapes are those that `grid_encode` asks for."""
-    if positions.ndim != 2 or positions.shape[1] != 3:
-        raise ValueError(f"positions must have shape (N, 3), got {tuple(positions.shape)}")
-    if table.ndim != 2 or table.shape[0] != levels.num_rows:
-        raise ValueError(f"table must have shape ({levels.num_rows}, F), got {tuple(table.shape)}")
+    check_shapes(positions=(positions, ("N", 3)), table=(table, (levels.num_rows, "F")))
 
 
 def grid_encode_reference(positions: Tensor, table: Tensor, levels: GridLevels) -> Tensor:
@@ -149,60 +141,25 @@ def grid_encode_reference(positions: Tensor, table: Tensor, levels: GridLevels) 
     return torch.cat(features, -1)
 
 
-@op("dnerf::grid_encode")
-def _grid_encode(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    return run_compiled("grid_encode", "forward", positions, table, cells, max_rows)
-
-
-@op("dnerf::grid_encode_rounded")
-def _grid_encode_rounded(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    return run_compiled("grid_encode", "forward_rounded", positions, table, cells, max_rows)
-
-
-@op("dnerf::grid_encode_grad_table")
-def _grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    return run_compiled("grid_encode", "grad_table", grad, positions, table, cells, max_rows)
-
-
-@op("dnerf::grid_encode_grad_positions")
-def _grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    return run_compiled("grid_encode", "grad_positions", grad, positions, table, cells, max_rows)
-
-
-@_grid_encode.register_fake
-def _(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    return table.new_empty((positions.shape[0], len(cells) // 3 * table.shape[1]))
-
-
-@_grid_encode_rounded.register_fake
-def _(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    return table.new_empty((positions.shape[0], len(cells) // 3 * table.shape[1]), dtype=torch.bfloat16)
-
-
-@_grad_table.register_fake
-def _(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    return torch.empty_like(table, memory_format=torch.contiguous_format)
-
-
-@_grad_positions.register_fake
-def _(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    return torch.empty_like(positions, memory_format=torch.contiguous_format)
+_INPUTS = "Tensor positions, Tensor table, int[] cells, int max_rows"
+_grad_table, _grad_positions = (
+    op(f"grid_encode_grad_{to}(Tensor grad, {_INPUTS}) -> Tensor", f"grid_encode.grad_{to}", gradient_of="grid_encode")
+    for to in ("table", "positions")
+)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    positions, table, ctx.cells, ctx.max_rows = inputs
+    positions, table, ctx.cells, ctx.max_rows, _ = inputs
     ctx.save_for_backward(positions, table)
 
 
-def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     arguments = (grad, *ctx.saved_tensors, ctx.cells, ctx.max_rows)
     needs_positions, needs_table = ctx.needs_input_grad[:2]
-    return (
-        torch.ops.dnerf.grid_encode_grad_positions(*arguments) if needs_positions else None,
-        torch.ops.dnerf.grid_encode_grad_table(*arguments) if needs_table else None,
-        None,
-        None,
-    )
+    to_positions = _grad_positions(*arguments) if needs_positions else None
+    return to_positions, _grad_table(*arguments) if needs_table else None, None, None, None
 
 
-_grid_encode.register_autograd(_backward, setup_context=_save)
+_grid_encode = op(
+    f"grid_encode({_INPUTS}, bool rounded) -> Tensor", "grid_encode.forward", backward=_backward, setup_context=_save
+)

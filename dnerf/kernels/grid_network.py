@@ -1,9 +1,11 @@
-"""A small network on features of a grid, without gradients: what pictures and filters ask of a field."""
+"""A small network on features of a grid, without gradients: for images and filters."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+
+from dnerf.core.checks import check_shape
 
 from .backend import choose, run_compiled
 from .grid_encode import GridLevels, check_grid, grid_encode
@@ -25,8 +27,8 @@ def grid_network(
         positions: (N, 3), in [0, 1].
         table: (T, F), T = `levels.num_rows`.
         levels: the grid's resolutions and table layout.
-        weights: of each layer, at least two, (out_features, in_features); the first one's inputs are the L F features.
-        biases: likewise, (out_features,).
+        weights, biases: of each layer, at least two, (out_features, in_features) and (out_features,); the first one's
+            inputs are the L F features.
 
     Returns:
         (N, out_features of the last layer).
@@ -37,12 +39,11 @@ def grid_network(
     if len(weights) < 2 or len(weights) != len(biases):
         raise ValueError(f"weights and biases must be of at least two layers, got {len(weights)} and {len(biases)}")
     in_features = levels.num_levels * table.shape[-1]
-    if weights[0].shape[-1] != in_features:
-        raise ValueError(f"the first weights must have {in_features} columns, got {tuple(weights[0].shape)}")
+    check_shape("the first weights", weights[0], ("n", in_features))
     if all(x.dtype == torch.float32 for x in (positions, table)) and is_fused(positions, in_features, weights):
         check_grid(positions, table, levels)
         rounded = [[x.bfloat16() for x in parameters] for parameters in (weights, biases)]
-        return torch.ops.dnerf.grid_network(positions, table, levels.cells, levels.max_rows, *rounded)
+        return _grid_network(positions, table, levels.cells, levels.max_rows, *rounded)
     return grid_network_reference(positions, table, levels, weights, biases)
 
 
@@ -55,22 +56,18 @@ def grid_network_reference(
     return torch.nn.functional.linear(hidden, weights[-1], biases[-1])
 
 
-def is_fused(positions: Tensor, in_features: int, weights: Sequence[Tensor]) -> bool:
-    """Whether a kernel is compiled for such networks, in the precision and on the processor of now."""
+def is_fused(positions: Tensor, in_features: int, weights: Sequence[Tensor], *, beside_tiles: bool = False) -> bool:
+    """Whether a kernel is compiled for such networks, in the precision and on the processor of now.
+
+    `beside_tiles`: also on processors that multiply whole tiles (AMX), where matrix libraries are as quick at layers.
+    """
     if not is_bfloat16_wanted(positions) or positions.is_cuda or choose(positions) != "numba":
         return False
-    return run_compiled("grid_network", "serves", positions, in_features, weights)
+    return run_compiled("grid_network", "serves", positions, in_features, weights, beside_tiles)
 
 
-@op("dnerf::grid_network")
-def _grid_network(
-    positions: Tensor, table: Tensor, cells: list[int], max_rows: int, weights: list[Tensor], biases: list[Tensor]
-) -> Tensor:
-    return run_compiled("grid_network", "forward", positions, table, cells, max_rows, weights, biases)
-
-
-@_grid_network.register_fake
-def _(
-    positions: Tensor, table: Tensor, cells: list[int], max_rows: int, weights: list[Tensor], biases: list[Tensor]
-) -> Tensor:
-    return positions.new_empty((positions.shape[0], weights[-1].shape[0]))
+_grid_network = op(
+    "grid_network(Tensor positions, Tensor table, int[] cells, int max_rows, Tensor[] weights, Tensor[] biases)"
+    " -> Tensor",
+    "grid_network.forward",
+)

@@ -7,20 +7,15 @@ import torch
 from torch import Tensor
 
 from .backend import choose, run_compiled
+from .checks import check_shapes
 from .grid_encode import GridLevels, grid_encode_reference
 
 
 @torch.no_grad()
 def lattice_places(
-    origins: Tensor,
-    directions: Tensor,
-    ray_indices: Tensor,
-    distances: Tensor,
-    displacements: Tensor,
-    shape: Sequence[int],
-    low: Tensor,
-    sides: Tensor,
-) -> Tensor:
+    origins: Tensor, directions: Tensor, ray_indices: Tensor, distances: Tensor, displacements: Tensor,
+    shape: Sequence[int], low: Tensor, sides: Tensor,
+) -> Tensor:  # fmt: skip
     """Positions at distances along rays, plus displacements interpolated between a lattice's vertices.
 
     Not differentiable.
@@ -33,8 +28,7 @@ def lattice_places(
         displacements: (V, C), C >= 3, of the vertices, x fastest; the first three numbers are the displacement in world
             units, NaN where it is not known.
         shape: vertices along z, y and x, at least two each; V in all.
-        low: (3,) lowest corner of the lattice, in world units.
-        sides: (3,) of it.
+        low, sides: (3,) lowest corner and sides of the lattice, in world units.
 
     Returns:
         (N, 3); NaN outside the lattice, and in cells of which a vertex is not known.
@@ -48,34 +42,19 @@ def lattice_places(
             f"displacements must have shape (V, 3 or more) of {tuple(shape)} vertices, at least two each, got "
             f"{tuple(displacements.shape)}"
         )
-    expected = {
-        "origins": (origins, (len(origins), 3)),
-        "directions": (directions, (len(origins), 3)),
-        "ray_indices": (ray_indices, (count,)),
-        "distances": (distances, (count,)),
-        "low": (low, (3,)),
-        "sides": (sides, (3,)),
-    }
-    for name, (value, wanted) in expected.items():
-        if value.shape != wanted:
-            raise ValueError(f"{name} must have shape {wanted}, got {tuple(value.shape)}")
+    check_shapes(origins=(origins, ("R", 3)), directions=(directions, (len(origins), 3)), low=(low, (3,)))
+    check_shapes(ray_indices=(ray_indices, (count,)), distances=(distances, (count,)), sides=(sides, (3,)))
     arguments = (origins, directions, ray_indices, distances, displacements, shape, low, sides)
     is_single = all(x.dtype == torch.float32 for x in (origins, directions, distances, displacements, low, sides))
-    if is_single and columns in (4, 8) and choose(distances) == "numba":
+    if is_single and columns == 4 and choose(distances) == "numba":
         return run_compiled("lattice_places", "lattice_places", *arguments)
     return lattice_places_reference(*arguments)
 
 
 def lattice_places_reference(
-    origins: Tensor,
-    directions: Tensor,
-    ray_indices: Tensor,
-    distances: Tensor,
-    displacements: Tensor,
-    shape: Sequence[int],
-    low: Tensor,
-    sides: Tensor,
-) -> Tensor:
+    origins: Tensor, directions: Tensor, ray_indices: Tensor, distances: Tensor, displacements: Tensor,
+    shape: Sequence[int], low: Tensor, sides: Tensor,
+) -> Tensor:  # fmt: skip
     """The definition of `lattice_places` in plain torch."""
     positions = origins[ray_indices] + distances[:, None] * directions[ray_indices]
     unit = (positions - low) / sides

@@ -1,11 +1,15 @@
 """Marching rays through a time-dependent occupancy grid."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from .backend import choose, run_compiled
+from dnerf.core.checks import check_positive, check_shape, check_whole
+
+from .backend import choose
+from .checks import check_cells, check_shapes
 from .op import op
 from .skip_distances import BLOCK_BITS, blocks_shape
 
@@ -14,8 +18,7 @@ class MarchedSamples(NamedTuple):
     """Packed intervals along rays.
 
     Attributes:
-        starts: (N,) distance where the interval starts.
-        ends: (N,) distance where it ends; > starts.
+        starts, ends: (N,) distances where the interval starts and where it ends; ends > starts.
         ray_indices: (N,) int64, sorted.
         offsets: (R + 1,) int64; ray r owns samples `offsets[r] : offsets[r + 1]`.
     """
@@ -30,20 +33,19 @@ class MarchGrid(NamedTuple):
     """What rays of one time are marched through.
 
     Attributes:
-        occupancy: (Gx, Gy, Gz) bool.
-        skips: `skip_distances` of it, without the axis of slabs.
+        occupancy, skips: (Gx, Gy, Gz) bool, and `skip_distances` of it, without the axis of slabs.
         aabb: (2, 3), lower and upper corner of the box that the cells fill, in world units.
         step: length of an interval, in world units.
-        splits: parts into which those in which something is seen are cut.
-        split_weight: weight in the picture up to which they are not.
+        subdivision: parts into which those in which something is visible are cut.
+        subdivision_weight: weight in the image up to which they are not.
     """
 
     occupancy: Tensor
     skips: Tensor
     aabb: Tensor
     step: float
-    splits: int = 1
-    split_weight: float = 0.0
+    subdivision: int = 1
+    subdivision_weight: float = 0.0
 
     def extent(self) -> Tensor:
         """A box (2, 3) that holds all kept intervals: blocks of cells, and half an interval around them."""
@@ -53,25 +55,16 @@ class MarchGrid(NamedTuple):
             bounds.append((blocks[0], blocks[-1] + 1) if blocks else (0, 0))
         cells = torch.tensor(bounds, device=self.aabb.device).T << BLOCK_BITS
         size = torch.tensor(self.occupancy.shape, device=self.aabb.device)
-        corners = torch.lerp(self.aabb[0], self.aabb[1], torch.minimum(cells, size) / size)
+        shares = (torch.minimum(cells, size) / size).to(self.aabb.dtype)
+        corners = torch.lerp(self.aabb[0], self.aabb[1], shares)
         return corners + self.step * corners.new_tensor([[-0.5], [0.5]])
 
 
 @torch.no_grad()
 def march(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    *,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: float,
-    max_samples_per_ray: int | None = None,
-    skips: Tensor | None = None,
-) -> MarchedSamples:
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, *, times: Tensor, jitter: Tensor, occupancy: Tensor,
+    aabb: Tensor, step: float, max_samples_per_ray: int | None = None, skips: Tensor | None = None,
+) -> MarchedSamples:  # fmt: skip
     """Cut rays into intervals of one length and keep those whose midpoint lies in an occupied cell.
 
     Ray r's interval k is `[near + (k - 1 + jitter) step, near + (k + jitter) step]`, clipped to the part of
@@ -87,8 +80,7 @@ def march(
         aabb: (2, 3), lower and upper corner of the box that the occupancy grid fills.
         step: length of an interval, > 0.
         max_samples_per_ray: keep only the first so many of each ray.
-        skips: `skip_distances(occupancy)`, which changes no result; worth keeping with a grid that is marched more
-            than once, since it is computed here otherwise.
+        skips: `skip_distances(occupancy)`, which changes no result; computed here if None.
 
     Returns:
         The kept intervals, ray by ray, in order of distance.
@@ -96,64 +88,45 @@ def march(
     Raises:
         ValueError: a shape or dtype that does not fit, or a step that is not positive.
     """
-    check_march(origins, directions, near, far, times, jitter, occupancy, aabb)
-    if not step > 0:
-        raise ValueError(f"step must be positive, got {step}")
-    if max_samples_per_ray is not None and max_samples_per_ray < 1:
-        raise ValueError(f"max_samples_per_ray must be at least 1, got {max_samples_per_ray}")
-    if skips is not None and skips.shape != blocks_shape(occupancy):
-        raise ValueError(f"skips must have shape {blocks_shape(occupancy)}, got {tuple(skips.shape)}")
-    dtype = torch.promote_types(origins.dtype, torch.float32)
-    rays = [x.to(dtype) for x in (origins, directions, near, far, times, jitter)]
-    arguments: tuple[Any, ...] = (*rays, occupancy, aabb.to(dtype), float(step), max_samples_per_ray)
+    rays, box = checked_rays(origins, directions, near, far, times, jitter, occupancy, aabb)
+    check_positive("step", step)
+    if max_samples_per_ray is not None:
+        check_whole("max_samples_per_ray", max_samples_per_ray)
+    if skips is not None:
+        check_shape("skips", skips, blocks_shape(occupancy))
     if choose(rays[0]) == "reference":
-        return march_reference(*arguments)
-    return MarchedSamples(*torch.ops.dnerf.march(*arguments, skips))
+        return march_reference(rays, occupancy, box, float(step), max_samples_per_ray)
+    return MarchedSamples(*_march(occupancy, rays, box, float(step), max_samples_per_ray, skips))
 
 
-def check_march(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
+_march = op(
+    "march(Tensor occupancy, Tensor[] rays, Tensor aabb, float step, int? limit, Tensor? skips)"
+    " -> (Tensor, Tensor, Tensor, Tensor)",
+    "march.march",
+)
+
+
+def checked_rays(
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, times: Tensor, jitter: Tensor, occupancy: Tensor,
     aabb: Tensor,
-) -> None:
-    """Raise ValueError unless shapes and dtypes are those that `march` asks for."""
-    num_rays = origins.shape[0]
-    for name, value in (("origins", origins), ("directions", directions)):
-        if value.shape != (num_rays, 3):
-            raise ValueError(f"{name} must have shape ({num_rays}, 3), got {tuple(value.shape)}")
-    for name, value in (("near", near), ("far", far), ("times", times), ("jitter", jitter)):
-        if value.shape != (num_rays,):
-            raise ValueError(f"{name} must have shape ({num_rays},), got {tuple(value.shape)}")
-    if occupancy.ndim != 4 or occupancy.dtype != torch.bool or not occupancy.numel():
-        raise ValueError(
-            f"occupancy must be bool of shape (K, Gx, Gy, Gz), got {occupancy.dtype} {tuple(occupancy.shape)}"
-        )
-    if aabb.shape != (2, 3):
-        raise ValueError(f"aabb must have shape (2, 3), got {tuple(aabb.shape)}")
+) -> tuple[list[Tensor], Tensor]:  # fmt: skip
+    """The six tensors of rays, and the box, in one dtype; ValueError unless they are as `march` asks."""
+    each = origins.shape[:1]
+    check_shapes(origins=(origins, (*each, 3)), directions=(directions, (*each, 3)), aabb=(aabb, (2, 3)))
+    check_shapes(near=(near, each), far=(far, each), times=(times, each), jitter=(jitter, each))
+    check_cells("occupancy", occupancy, "K, Gx, Gy, Gz", least=1)
+    dtype = torch.promote_types(origins.dtype, torch.float32)
+    return [x.to(dtype) for x in (origins, directions, near, far, times, jitter)], aabb.to(dtype)
 
 
 def march_reference(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: float,
-    max_samples_per_ray: int | None,
+    rays: Sequence[Tensor], occupancy: Tensor, aabb: Tensor, step: float, max_samples_per_ray: int | None
 ) -> MarchedSamples:
     """The definition of `march` in plain torch: it tests every interval of every ray.
 
     The compiled versions round like this one, operation by operation, and so return the same bits.
     """
-    starts, ends, keep = kept_intervals(origins, directions, near, far, times, jitter, occupancy, aabb, step)
+    starts, ends, keep = kept_intervals(rays, occupancy, aabb, step)
     if max_samples_per_ray is not None:
         keep &= keep.cumsum(-1) <= max_samples_per_ray
     offsets = torch.nn.functional.pad(keep.sum(-1).cumsum(0), (1, 0))
@@ -161,23 +134,15 @@ def march_reference(
 
 
 def kept_intervals(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: float,
+    rays: Sequence[Tensor], occupancy: Tensor, aabb: Tensor, step: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Start and end of every interval that a ray may have, and which are kept, (R, J) each."""
+    origins, directions, near, far, times, jitter = rays
     enter, leave, first, counts = interval_ranges(origins, directions, near, far, jitter, aabb, step)
     num_intervals = int(counts.max()) if len(counts) else 0
     index = first[:, None] + torch.arange(num_intervals, device=near.device).to(near.dtype)
     starts = (near[:, None] + (index - 1 + jitter[:, None]) * step).maximum(enter[:, None])
     ends = (near[:, None] + (index + jitter[:, None]) * step).minimum(leave[:, None])
-
     middles = (starts + ends) * 0.5
     shape = torch.tensor(occupancy.shape[1:], device=occupancy.device)
     positions = origins[:, None] + directions[:, None] * middles[..., None]
@@ -207,54 +172,3 @@ def interval_ranges(
     hit = (length > 0) & length.isfinite()
     first = torch.where(hit, ((enter - near) / step - jitter).floor(), 0)
     return enter, leave, first, torch.where(hit, (length / step).ceil() + 3, 0)
-
-
-@op("dnerf::march")
-def _march(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: float,
-    max_samples_per_ray: int | None,
-    skips: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return run_compiled(
-        "march",
-        "march",
-        origins,
-        directions,
-        near,
-        far,
-        times,
-        jitter,
-        occupancy,
-        aabb,
-        step,
-        max_samples_per_ray,
-        skips,
-    )
-
-
-@_march.register_fake
-def _(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: float,
-    max_samples_per_ray: int | None,
-    skips: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    num_samples = torch.library.get_ctx().new_dynamic_size()
-    starts = origins.new_empty(num_samples)
-    indices = origins.new_empty(num_samples, dtype=torch.int64)
-    return starts, starts.clone(), indices, near.new_empty(near.shape[0] + 1, dtype=torch.int64)

@@ -5,9 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import choose, run_compiled
+from .backend import choose
+from .checks import check_offsets, check_shape
 from .op import op
-from .packed_weights import check_offsets
 
 
 def packed_sum(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tensor:
@@ -28,18 +28,17 @@ def packed_sum(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tenso
     """
     if values.ndim not in (1, 2):
         raise ValueError(f"values must have shape (N, C) or (N,), got {tuple(values.shape)}")
-    if weights is not None and weights.shape != values.shape[:1]:
-        raise ValueError(f"weights must have shape ({values.shape[0]},), got {tuple(weights.shape)}")
     check_offsets(offsets)
     dtype = torch.promote_types(values.dtype, torch.float32)
     if weights is not None:
+        check_shape("weights", weights, values.shape[:1])
         dtype = torch.promote_types(dtype, weights.dtype)
         weights = weights.to(dtype)
     columns = values.to(dtype) if values.ndim == 2 else values.to(dtype)[:, None]
     if choose(columns) == "reference":
         sums = packed_sum_reference(columns, weights, offsets)
     else:
-        sums = torch.ops.dnerf.packed_sum(columns, weights, offsets)
+        sums = _packed_sum(columns, weights, offsets)
     return sums if values.ndim == 2 else sums[:, 0]
 
 
@@ -52,34 +51,14 @@ def packed_sum_reference(values: Tensor, weights: Tensor | None, offsets: Tensor
     return sums.index_add(0, rays, weighted.double()).to(weighted.dtype)
 
 
-@op("dnerf::packed_sum")
-def _packed_sum(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tensor:
-    return run_compiled("packed", "sums", values, weights, offsets)
-
-
-@op("dnerf::packed_sum_grad_values")
-def _grad_values(grad: Tensor, weights: Tensor | None, offsets: Tensor, num_samples: int) -> Tensor:
-    return run_compiled("packed", "grad_values", grad, weights, offsets, num_samples)
-
-
-@op("dnerf::packed_sum_grad_weights")
-def _grad_weights(grad: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
-    return run_compiled("packed", "grad_weights", grad, values, offsets)
-
-
-@_packed_sum.register_fake
-def _(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tensor:
-    return values.new_empty((offsets.shape[0] - 1, values.shape[1]))
-
-
-@_grad_values.register_fake
-def _(grad: Tensor, weights: Tensor | None, offsets: Tensor, num_samples: int) -> Tensor:
-    return grad.new_empty((num_samples, grad.shape[1]))
-
-
-@_grad_weights.register_fake
-def _(grad: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
-    return grad.new_empty(values.shape[:1])
+_grad_values = op(
+    "packed_sum_grad_values(Tensor grad, Tensor? weights, Tensor offsets, int num_samples) -> Tensor",
+    "packed.grad_values", gradient_of="packed_sum",
+)  # fmt: skip
+_grad_weights = op(
+    "packed_sum_grad_weights(Tensor grad, Tensor values, Tensor offsets) -> Tensor",
+    "packed.grad_weights", gradient_of="packed_sum",
+)  # fmt: skip
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -92,12 +71,11 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
     values, weights, offsets = ctx.saved_tensors
     needs_values, needs_weights = ctx.needs_input_grad[:2]
-    ops = torch.ops.dnerf
-    return (
-        ops.packed_sum_grad_values(grad, weights, offsets, ctx.num_samples) if needs_values else None,
-        ops.packed_sum_grad_weights(grad, values, offsets) if needs_weights else None,
-        None,
-    )
+    to_values = _grad_values(grad, weights, offsets, ctx.num_samples) if needs_values else None
+    return to_values, _grad_weights(grad, values, offsets) if needs_weights else None, None
 
 
-_packed_sum.register_autograd(_backward, setup_context=_save)
+_packed_sum = op(
+    "packed_sum(Tensor values, Tensor? weights, Tensor offsets) -> Tensor", "packed.sums", backward=_backward,
+    setup_context=_save,
+)  # fmt: skip

@@ -5,8 +5,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import choose, run_compiled
+from .backend import choose
+from .checks import check_offsets, check_shape
 from .op import op
+
+MOST_DENSITY = 1e30  # as `dnerf.core.quadrature.OPAQUE`: infinite density on an interval of no length adds nothing
 
 
 def packed_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
@@ -27,14 +30,13 @@ def packed_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
 
     The compiled versions are differentiable once; second derivatives need `use_backend("reference")`.
     """
-    if optical_depth.ndim != 1:
-        raise ValueError(f"optical_depth must have shape (N,), got {tuple(optical_depth.shape)}")
+    check_shape("optical_depth", optical_depth, ("N",))
     check_offsets(offsets)
     if optical_depth.dtype != torch.float32:
         optical_depth = optical_depth.to(torch.promote_types(optical_depth.dtype, torch.float32))
     if choose(optical_depth) == "reference":
         return packed_weights_reference(optical_depth, offsets)
-    return torch.ops.dnerf.packed_weights(optical_depth, offsets)
+    return _packed_weights(optical_depth, offsets)
 
 
 def packed_weights_reference(optical_depth: Tensor, offsets: Tensor) -> Tensor:
@@ -50,30 +52,10 @@ def packed_weights_reference(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     return (torch.exp(-before) * -torch.expm1(-padded))[rays, columns]
 
 
-def check_offsets(offsets: Tensor) -> None:
-    """Raise ValueError unless the offsets can be those of packed samples, as far as shape and dtype say."""
-    if offsets.ndim != 1 or offsets.shape[0] < 1 or offsets.dtype != torch.int64:
-        raise ValueError(f"offsets must be int64 of shape (R + 1,), got {offsets.dtype} {tuple(offsets.shape)}")
-
-
-@op("dnerf::packed_weights")
-def _packed_weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
-    return run_compiled("packed", "weights", optical_depth, offsets)
-
-
-@op("dnerf::packed_weights_grad")
-def _packed_weights_grad(grad: Tensor, optical_depth: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
-    return run_compiled("packed", "grad_optical_depth", grad, optical_depth, weights, offsets)
-
-
-@_packed_weights.register_fake
-def _(optical_depth: Tensor, offsets: Tensor) -> Tensor:
-    return torch.empty_like(optical_depth, memory_format=torch.contiguous_format)
-
-
-@_packed_weights_grad.register_fake
-def _(grad: Tensor, optical_depth: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
-    return torch.empty_like(optical_depth, memory_format=torch.contiguous_format)
+_packed_weights_grad = op(
+    "packed_weights_grad(Tensor grad, Tensor optical_depth, Tensor weights, Tensor offsets) -> Tensor",
+    "packed.grad_optical_depth", gradient_of="packed_weights",
+)  # fmt: skip
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -81,7 +63,10 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 
 def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-    return torch.ops.dnerf.packed_weights_grad(grad, *ctx.saved_tensors), None
+    return _packed_weights_grad(grad, *ctx.saved_tensors), None
 
 
-_packed_weights.register_autograd(_backward, setup_context=_save)
+_packed_weights = op(
+    "packed_weights(Tensor optical_depth, Tensor offsets) -> Tensor", "packed.weights", backward=_backward,
+    setup_context=_save,
+)  # fmt: skip

@@ -18,16 +18,13 @@ def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tens
     """ReLU(W x + b), layer after layer.
 
     Under autocast to bfloat16, on CPUs that have it, oneDNN adds the bias and cuts off what is negative while it
-    multiplies: one pass over memory instead of three, whose time is what such small networks take. Sums are then
-    rounded in another order, and what was negative is -`SLOPE` times its size instead of zero. CPUs that multiply
-    vectors in bfloat16, but no tiles (AMX), do without oneDNN where layers' widths are multiples of 16: a few hundred
-    rows go through all layers in registers and the nearest caches. On GPUs gradients to biases are products with ones,
-    since sums over rows take several times as long there.
+    multiplies: one pass over memory instead of three. Sums are then rounded in another order, and what was negative is
+    -`SLOPE` times its size instead of zero. CPUs that multiply vectors in bfloat16, but no tiles (AMX), do without
+    oneDNN where layers' widths are multiples of 16: a few hundred rows go through all layers in the nearest caches.
 
     Args:
         inputs: (..., in_features).
-        weights: of each layer, at least one, (out_features, in_features).
-        biases: likewise, (out_features,).
+        weights, biases: of each layer, at least one, (out_features, in_features) and (out_features,).
 
     Returns:
         (..., out_features of the last layer), differentiable to any order.
@@ -53,47 +50,33 @@ def relu_layers_reference(inputs: Tensor, weights: Sequence[Tensor], biases: Seq
 
 def is_bfloat16_wanted(inputs: Tensor) -> bool:
     """Whether layers round such inputs to bfloat16: under autocast, where there are instructions for it."""
-    if inputs.is_cuda:
-        return (
-            inputs.dtype != torch.float64
-            and torch.is_autocast_enabled("cuda")
-            and torch.get_autocast_dtype("cuda") == torch.bfloat16
-        )
-    return (
-        inputs.is_cpu
-        and inputs.dtype != torch.float64
-        and torch.is_autocast_enabled("cpu")
-        and torch.get_autocast_dtype("cpu") == torch.bfloat16
-        and torch.backends.mkldnn.is_available()
-        and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    device = inputs.device.type
+    if device not in ("cpu", "cuda") or inputs.dtype == torch.float64 or not torch.is_autocast_enabled(device):
+        return False
+    has_instructions = inputs.is_cuda or (
+        torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     )
+    return has_instructions and torch.get_autocast_dtype(device) == torch.bfloat16
 
 
 def _run(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, is_kept: bool) -> list[Tensor]:
     """The last layer's outputs, or those of all."""
     if inputs.is_cpu and run_compiled("relu_layers", "serves", inputs, weights):
-        return torch.ops.dnerf.relu_layers(inputs, list(weights), list(biases), is_kept)
+        return _relu_layers(inputs, list(weights), list(biases), is_kept)
     outputs = [inputs]
     for weight, bias in zip(weights, biases, strict=True):
         # Without those before, each takes the memory of the one before the last, which is still near.
-        outputs = [*(outputs if is_kept else []), _layer(outputs[-1], weight, bias)]
+        if inputs.is_cuda:
+            following = torch.relu_(torch.addmm(bias, outputs[-1], weight.mT))
+        else:
+            following = torch.ops.mkldnn._linear_pointwise(outputs[-1], weight, bias, "leaky_relu", [SLOPE], "")
+        outputs = [*(outputs if is_kept else []), following]
     return outputs[1:] if is_kept else outputs
 
 
-@op("dnerf::relu_layers")
-def _relu_layers(inputs: Tensor, weights: list[Tensor], biases: list[Tensor], is_kept: bool) -> list[Tensor]:
-    return run_compiled("relu_layers", "relu_layers", inputs, weights, biases, is_kept)
-
-
-@_relu_layers.register_fake
-def _(inputs: Tensor, weights: list[Tensor], biases: list[Tensor], is_kept: bool) -> list[Tensor]:
-    return [inputs.new_empty(len(inputs), len(weight)) for weight in (weights if is_kept else weights[-1:])]
-
-
-def _layer(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    if inputs.is_cuda:
-        return torch.relu_(torch.addmm(bias, inputs, weight.mT))
-    return torch.ops.mkldnn._linear_pointwise(inputs, weight, bias, "leaky_relu", [SLOPE], "")
+_relu_layers = op(
+    "relu_layers(Tensor inputs, Tensor[] weights, Tensor[] biases, bool is_kept) -> Tensor[]", "relu_layers.relu_layers"
+)
 
 
 class _Layers(torch.autograd.Function):
@@ -113,6 +96,7 @@ class _Layers(torch.autograd.Function):
         for i in reversed(range(num_layers)):
             grad = torch.ops.aten.threshold_backward(grad, outputs[i + 1], 0)
             of_weights[i] = _outer_sum(grad, outputs[i])
+            # On GPUs a product with ones takes a fraction of what a sum over rows does.
             of_biases[i] = grad.new_ones(1, len(grad)).mm(grad)[0] if grad.is_cuda else grad.sum(0)
             if i or ctx.needs_input_grad[0]:
                 grad = grad @ weights[i]

@@ -1,14 +1,16 @@
-"""Which intervals of rays are seen, and the parts into which they are cut."""
+"""Which intervals of rays are visible, and the parts into which they are cut."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dnerf.rays import parts_of
+from dnerf.core.checks import check_whole
+from dnerf.core.rays import parts_of
 
 from .backend import choose, run_compiled
-from .packed_weights import packed_weights
+from .checks import check_offsets, check_shapes
+from .packed_weights import MOST_DENSITY, packed_weights
 
 
 class SeenParts(NamedTuple):
@@ -32,20 +34,13 @@ class SeenParts(NamedTuple):
 
 @torch.no_grad()
 def seen_parts(
-    starts: Tensor,
-    ends: Tensor,
-    offsets: Tensor,
-    density: Tensor,
-    light: Tensor,
-    *,
-    splits: int,
-    split_weight: float,
-    min_weight: float,
-) -> SeenParts:
-    """Leave out intervals that are not seen, and cut those that are seen well into parts of equal lengths.
+    starts: Tensor, ends: Tensor, offsets: Tensor, density: Tensor, light: Tensor, *, subdivision: int,
+    subdivision_weight: float, min_weight: float,
+) -> SeenParts:  # fmt: skip
+    """Leave out intervals that are not visible, and cut those that are well visible into parts of equal lengths.
 
     An interval's weight is `packed_weights` of its optical depth times the light that comes to its ray's first one.
-    Those up to `min_weight` are left out, those up to `split_weight` stay whole, those above and NaN are cut. Not
+    Those up to `min_weight` are left out, those up to `subdivision_weight` stay whole, those above and NaN are cut. Not
     differentiable.
 
     Args:
@@ -53,22 +48,18 @@ def seen_parts(
         offsets: (R + 1,) int64, where each ray's intervals begin and end.
         density: (N,), in 1 / unit of the distances, >= 0.
         light: (R,) transmittance before each ray's first interval.
-        splits: parts of an interval that is cut, >= 1.
-        split_weight: see above.
-        min_weight: likewise.
+        subdivision: parts of an interval that is cut, >= 1.
+        subdivision_weight, min_weight: see above.
 
     Raises:
-        ValueError: shapes that do not fit each other, splits below 1, or (by the compiled version) offsets that do not
-            run from 0 to N.
+        ValueError: shapes that do not fit each other, subdivision below 1, or (by the compiled version) offsets that do
+            not run from 0 to N.
     """
-    if splits < 1:
-        raise ValueError(f"splits must be at least 1, got {splits}")
-    if offsets.ndim != 1 or light.shape != (len(offsets) - 1,):
-        raise ValueError(f"offsets and light must have shapes (R + 1,) and (R,), got {offsets.shape} and {light.shape}")
-    for name, value in (("ends", ends), ("density", density)):
-        if value.shape != starts.shape or starts.ndim != 1:
-            raise ValueError(f"starts and {name} must have shape (N,), got {tuple(starts.shape)}, {tuple(value.shape)}")
-    arguments = (starts, ends, offsets, density, light, splits, split_weight, min_weight)
+    check_whole("subdivision", subdivision)
+    check_offsets(offsets)
+    check_shapes(starts=(starts, ("N",)), ends=(ends, starts.shape), density=(density, starts.shape))
+    check_shapes(light=(light, (len(offsets) - 1,)))
+    arguments = (starts, ends, offsets, density, light, subdivision, subdivision_weight, min_weight)
     is_of_one_kind = all(x.dtype == starts.dtype for x in (ends, density, light))
     if is_of_one_kind and choose(starts) == "numba":
         return SeenParts(*run_compiled("seen_parts", "seen_parts", *arguments))
@@ -76,19 +67,13 @@ def seen_parts(
 
 
 def seen_parts_reference(
-    starts: Tensor,
-    ends: Tensor,
-    offsets: Tensor,
-    density: Tensor,
-    light: Tensor,
-    splits: int,
-    split_weight: float,
-    min_weight: float,
-) -> SeenParts:
+    starts: Tensor, ends: Tensor, offsets: Tensor, density: Tensor, light: Tensor, subdivision: int,
+    subdivision_weight: float, min_weight: float,
+) -> SeenParts:  # fmt: skip
     """The definition of `seen_parts` in plain torch."""
     rays = torch.repeat_interleave(offsets.diff())
-    weights = packed_weights(density * (ends - starts), offsets) * light[rays]
-    counts = torch.where(weights <= min_weight, 0, torch.where(weights <= split_weight, 1, splits))
+    weights = packed_weights(density.clamp(max=MOST_DENSITY) * (ends - starts), offsets) * light[rays]
+    counts = torch.where(weights <= min_weight, 0, torch.where(weights <= subdivision_weight, 1, subdivision))
     whole, number = parts_of(counts)
     before = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     first, last, parts = starts[whole], ends[whole], counts[whole]

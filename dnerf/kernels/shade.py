@@ -4,13 +4,14 @@ import torch
 from torch import Tensor
 
 from .backend import choose, run_compiled
+from .checks import check_shapes
 
 MOST_LOG_DENSITY = 15.0  # as `dnerf.fields.activations.truncated_exp`
 
 
 @torch.no_grad()
 def shade(raw: Tensor, bias: Tensor, log_shift: float) -> tuple[Tensor, Tensor]:
-    """exp(min(r_0 + b_0 + log_shift, 15)), and sigmoid(r_k + b_k) of the other three. Not differentiable: for pictures.
+    """exp(min(r_0 + b_0 + log_shift, 15)), and sigmoid(r_k + b_k) of the other three. Not differentiable: for images.
 
     Args:
         raw: (N, 4) products, of density, red, green and blue.
@@ -23,8 +24,7 @@ def shade(raw: Tensor, bias: Tensor, log_shift: float) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: a shape that does not fit.
     """
-    if raw.ndim != 2 or raw.shape[1] != 4 or bias.shape != (4,):
-        raise ValueError(f"raw and bias must have shapes (N, 4) and (4,), got {tuple(raw.shape)}, {tuple(bias.shape)}")
+    check_shapes(raw=(raw, ("N", 4)), bias=(bias, (4,)))
     dtype = torch.promote_types(raw.dtype, torch.float32)
     bias = bias.to(dtype)
     if raw.dtype in (torch.bfloat16, torch.float32) and choose(bias) == "numba":

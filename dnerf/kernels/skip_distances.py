@@ -5,6 +5,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .backend import choose, run_compiled
+from .checks import check_cells
 
 BLOCK_BITS = 3
 BLOCK = 1 << BLOCK_BITS
@@ -33,10 +34,7 @@ def skip_distances(occupancy: Tensor) -> Tensor:
     Raises:
         ValueError: the grid is not bool of four axes.
     """
-    if occupancy.ndim != 4 or occupancy.dtype != torch.bool:
-        raise ValueError(
-            f"occupancy must be bool of shape (K, Gx, Gy, Gz), got {occupancy.dtype} {tuple(occupancy.shape)}"
-        )
+    check_cells("occupancy", occupancy, "K, Gx, Gy, Gz")
     if occupancy.is_cpu and choose(occupancy.new_empty(0, dtype=torch.float32)) == "numba":
         return run_compiled("skip_distances", "skip_distances", occupancy)
     return skip_distances_reference(occupancy)

@@ -3,7 +3,10 @@
 import torch
 from torch import Tensor
 
+from dnerf.core.checks import check_positive
+
 from .backend import choose, run_compiled
+from .checks import check_shapes
 
 # Least cosine between steps along one line: what rounding leaves of steps of 1e-4 units, one unit from the origin.
 STRAIGHT = 1 - 1e-5
@@ -28,12 +31,8 @@ def thin_out(points: Tensor, times: Tensor, spacing: float) -> tuple[Tensor, Ten
     Raises:
         ValueError: shapes that do not fit, or a spacing that is not positive.
     """
-    if points.ndim != 2 or points.shape[1] != 3 or times.shape != points.shape[:1]:
-        raise ValueError(
-            f"points and times must have shapes (N, 3) and (N,), got {tuple(points.shape)} and {tuple(times.shape)}"
-        )
-    if not spacing > 0:
-        raise ValueError(f"spacing must be positive, got {spacing}")
+    check_shapes(points=(points, ("N", 3)), times=(times, points.shape[:1]))
+    check_positive("spacing", spacing)
     if points.is_cpu and choose(points) == "numba":
         return run_compiled("thin_out", "thin_out", points, times, spacing)
     return thin_out_reference(points, times, spacing)

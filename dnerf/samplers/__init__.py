@@ -1,9 +1,13 @@
 """Samplers: where along the rays the field is evaluated."""
 
-from dnerf.samplers.base import Sampler
+from dnerf.samplers.base import Capacity, FixedCapacity, FrontToBack, OccupancyAware, OccupiedCells, Sampler
 from dnerf.samplers.importance import ImportanceSampler
 from dnerf.samplers.inverse_cdf import sample_piecewise_constant
 from dnerf.samplers.occupancy import OccupancySampler
+from dnerf.samplers.occupancy_grid import OccupancyGrid
 from dnerf.samplers.stratified import StratifiedSampler
 
-__all__ = ["ImportanceSampler", "OccupancySampler", "Sampler", "StratifiedSampler", "sample_piecewise_constant"]
+__all__ = [
+    "Capacity", "FixedCapacity", "FrontToBack", "ImportanceSampler", "OccupancyAware", "OccupancyGrid",
+    "OccupancySampler", "OccupiedCells", "Sampler", "StratifiedSampler", "sample_piecewise_constant",
+]  # fmt: skip

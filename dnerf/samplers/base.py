@@ -1,15 +1,17 @@
-"""What a sampler is: it decides where along the rays a field is evaluated."""
+"""What a sampler is, and what some of them can do beside: each ability is a small class of its own."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Hashable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.cameras import Camera
-from dnerf.compositing import FieldOutput
-from dnerf.fields.base import RadianceField, ask_along
+from dnerf.core.cameras import Camera
+from dnerf.core.compositing import FieldOutput
+from dnerf.core.rays import Rays, Samples
+from dnerf.fields.base import RadianceField
 from dnerf.kernels import MarchGrid
-from dnerf.rays import Rays, Samples
 
 
 class Sampler(nn.Module, ABC):
@@ -20,165 +22,108 @@ class Sampler(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
-        """Samples along R rays, dense or packed; no gradient flows to where they lie.
+        """Samples along R rays, dense or packed; samplers that look where something is evaluate the field.
 
-        Args:
-            rays: R rays.
-            field: the field that will be rendered; samplers that look where matter is ask it.
-            generator: source of randomness in training mode.
+        Gradients reach rays through the positions of samples, and through where samples lie on them as far as the
+        sampler says. `StratifiedSampler`: all of it, a box's faces included: camera poses may be fitted by them.
+        `ImportanceSampler` and `OccupancySampler`: distances that follow density count as constants. Gradients are then
+        those of the light up to the quadrature's error, not those of the number that was computed.
         """
 
-    def first(self, rays: Rays, most: int) -> Samples | None:
-        """In evaluation mode, the first samples of each of R rays, for those who look front to back.
+    def update(self, field: RadianceField, step: int) -> None:
+        """Learn from the field after so many training steps; does nothing unless overridden."""
 
-        Args:
-            rays: R rays.
-            most: samples of a ray.
+    def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:
+        """Learn from the density (...,) at the samples of a training step, at positions (..., 3) and times (...,)."""
 
-        Returns:
-            Packed samples; what `forward` places from the end of a ray's last one on is what would have followed. None
-            from a sampler that cannot tell the first without the others (unless overridden).
-        """
-        return None
 
-    def refined(
-        self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
-    ) -> tuple[Samples, FieldOutput]:
-        """In evaluation mode, where the field is asked for what is seen of the samples that `first` placed.
+@dataclass(frozen=True)
+class OccupiedCells:
+    """Which cells of a box are occupied."""
 
-        Args:
-            samples: packed samples of R rays.
-            rays: R rays.
-            field: which is rendered.
-            transmittance: (R,) before each ray's first sample.
-            min_weight: what has less of a share in the picture may be left out.
+    box: Tensor  # (2, 3) corners, in world units
+    mask: Tensor  # (Gx, Gy, Gz) bool
 
-        Returns:
-            Packed samples of the same rays, in the same intervals, and what the field says there, without extras;
-            those themselves unless overridden.
-        """
-        assert samples.ray_indices is not None
-        return samples, ask_along(field, rays, samples.ray_indices, samples.distances)
 
-    def seen_rays(self, camera: Camera, time: float) -> tuple[Tensor, Rays] | None:
-        """Pixels of a view in whose rays this sampler may place samples in evaluation mode; all unless overridden.
+class OccupancyAware(ABC):
+    """A sampler that knows where something is, and so which pixels can show it."""
 
-        Args:
-            camera: the view, on the sampler's device.
-            time: of the frame, in [0, 1].
+    @abstractmethod
+    def occupied_cells(self, time: float | None) -> OccupiedCells:
+        """The cells that images look into at a time in [0, 1]; None for those of any time."""
+
+    @abstractmethod
+    def occupied_positions(self, unit: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (N, 3) and times (N,) in occupied cells, evenly spread over all of them as the given numbers are:
+        (N, 5) in [0, 1), which cell, and the time and the position within it."""
+
+    @abstractmethod
+    def march_grid(self, time: float, dtype: torch.dtype) -> MarchGrid:
+        """The cells of which images of a time keep the intervals; in the rays' dtype it may round to another slab."""
+
+    @abstractmethod
+    def visible_rays(self, camera: Camera, time: float) -> tuple[Tensor, Rays] | None:
+        """Pixels of a view, on the sampler's device, in whose rays there may be samples in evaluation mode.
 
         Returns:
             Their numbers (P,) int64, `row * width + column`, in order, and their rays, which may be cut short where
             they meet nothing, by whole intervals; None for all of them.
         """
-        return None
 
-    def grid_at(self, time: float, dtype: torch.dtype) -> MarchGrid | None:
-        """The cells of which evaluation mode keeps the intervals of `march`; None unless overridden.
 
-        Args:
-            time: of all rays, in [0, 1].
-            dtype: of the rays, in which a time may round to another slab.
+class FrontToBack(ABC):
+    """A sampler that places the first samples of rays without the others, so that rays can end where light does."""
+
+    @abstractmethod
+    def first(self, rays: Rays, most: int) -> Samples:
+        """In evaluation mode, the first samples, packed, at most `most` of each of R rays.
+
+        What `forward` places from the end of a ray's last one on is what would have followed.
         """
-        return None
 
-    def to_size(
-        self,
-        rays: Rays,
-        field: RadianceField,
-        marched: int,
-        kept: int,
-        *,
-        min_weight: float,
-        generator: torch.Generator | None = None,
-    ) -> tuple[Samples, Tensor]:
-        """Samples in a fixed number of places, found without waiting for a device. Not every sampler can.
+    @abstractmethod
+    def refined(
+        self, samples: Samples, rays: Rays, field: RadianceField, transmittance: Tensor, min_weight: float
+    ) -> tuple[Samples, FieldOutput]:
+        """In evaluation mode, subdivide those of the samples that `first` placed that are visible.
+
+        The transmittance (R,) is that before each ray's first sample; what has less than `min_weight` of a share in the
+        image may be left out.
+
+        Returns:
+            Packed samples of the same rays, in the same intervals, and the field's output there, without extras.
+        """
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """How many places there are for samples."""
+
+    marched: int  # for intervals that may hold something
+    kept: int  # for samples
+    min_weight: float | None = None  # in the image, up to which intervals are left out; None as in training
+
+
+class FixedCapacity(ABC):
+    """A sampler that fills a fixed number of places without waiting for a device, so that CUDA graphs can replay it."""
+
+    @abstractmethod
+    def sample_fixed(
+        self, rays: Rays, field: RadianceField, capacity: Capacity, *, generator: torch.Generator | None = None
+    ) -> Samples:
+        """Packed samples in `capacity.kept` places, some of length zero; `Samples.wanted` says how many were wanted.
 
         Rays that do not fit get none: they show the background, and train nothing.
-
-        Args:
-            rays: R rays.
-            field: which is asked for densities.
-            marched: places for intervals that may hold something.
-            kept: places for samples.
-            min_weight: in the picture, up to which intervals are left out; 0 for none.
-            generator: source of randomness in training mode.
-
-        Returns:
-            Packed samples, `kept` of them, some of length zero; and how many places of either kind were wanted, (2,).
-
-        Raises:
-            ValueError: if this sampler cannot (unless overridden).
         """
-        raise ValueError(f"{type(self).__name__} cannot place samples in a fixed number of places")
 
-    def fix_sizes(self, marched: int | None, kept: int | None = None) -> None:
-        """In training, place samples by `to_size` from now on, in so many places; None for no more.
+    @abstractmethod
+    def path_key(self) -> Hashable:
+        """What decides, beside tensors, how samples are placed now: when it changes, graphs are recorded anew."""
 
-        Raises:
-            ValueError: if this sampler cannot (unless overridden).
-        """
-        if marched is not None:
-            raise ValueError(f"{type(self).__name__} cannot place samples in a fixed number of places")
-
-    def fullness(self) -> float:
-        """The larger share of its fixed places that the last training batch wanted; above 1, some rays went without."""
-        raise ValueError(f"{type(self).__name__} has no fixed number of places")
-
-    @property
-    def settings(self) -> tuple[object, ...]:
-        """What decides, beside tensors, how samples are placed now: when it changes, CUDA graphs are recorded anew."""
-        return ()
-
-    @property
-    def share(self) -> float:
-        """Share of space, averaged over time, in which pictures have samples; 1 unless known to be less."""
-        return 1.0
-
-    def cells_at_any_time(self) -> tuple[Tensor, Tensor] | None:
-        """Corners (2, 3) of what this sampler keeps account of, and which of the cells (Gx, Gy, Gz) that it is cut into
-        pictures look into at some time; None if it keeps none."""
-        return None
-
-    def places(self, unit: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Places where matter may be, evenly spread over all of them; None if this sampler does not know.
-
-        Args:
-            unit: (N, 5) numbers in [0, 1), evenly spread: which region, and the time and the position within it.
-
-        Returns:
-            positions (N, 3) in world units and times (N,) in [0, 1].
-        """
-        return None
-
-    def update(self, field: RadianceField, step: int) -> None:
-        """Learn from the field between training steps, if this sampler does and it is time.
-
-        Args:
-            field: the field in training.
-            step: number of training steps done so far.
-        """
-        probes = self.probes(step)
-        if probes is not None:
-            self.learn(field, probes)
-
+    @abstractmethod
     def probes(self, step: int) -> Tensor | None:
-        """Random numbers (N, K) for `learn`, or None if nothing is to be learnt after so many steps."""
-        return None
+        """Random numbers for `learn`, or None if `update` would do nothing after so many steps."""
 
+    @abstractmethod
     def learn(self, field: RadianceField, probes: Tensor) -> None:
-        """Learn from the field at random places; does nothing, and waits for no device, unless overridden.
-
-        Args:
-            field: the field in training.
-            probes: from `probes`.
-        """
-
-    def observe(self, positions: Tensor, times: Tensor, density: Tensor) -> None:
-        """Learn from what the field said at the samples of a training step; does nothing unless overridden.
-
-        Args:
-            positions: (..., 3) of the samples, in world units.
-            times: (...,) of the samples.
-            density: (...,) that the field said there.
-        """
+        """What `update` does, with `probes`, without waiting for a device."""

@@ -5,11 +5,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dnerf.checks import check_choice, check_positive
-from dnerf.compositing import FieldOutput, render_weights
+from dnerf.core.checks import check_choice, check_positive
+from dnerf.core.compositing import FieldOutput, render_weights
+from dnerf.core.quadrature import interval_depths, sample_piecewise_linear
+from dnerf.core.rays import Rays, Samples
 from dnerf.fields.base import RadianceField
-from dnerf.quadrature import sample_piecewise_linear
-from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 from dnerf.samplers.inverse_cdf import sample_piecewise_constant
 from dnerf.samplers.stratified import StratifiedSampler, random_points
@@ -18,8 +18,8 @@ from dnerf.samplers.stratified import StratifiedSampler, random_points
 class ImportanceSampler(Sampler):
     """Stratified coarse samples, then edges drawn from their weights; intervals between all edges are rendered.
 
-    Source: NeRF (arXiv 2003.08934) section 5.2. With a `proposal` field (the coarse network) the coarse pass asks
-    it and its output goes with the samples, so that a loss can train it; without, it asks the rendered field itself
+    Source: NeRF (arXiv 2003.08934) section 5.2. With a `proposal` field (the coarse network) the coarse pass
+    evaluates it and its output goes with the samples, so that a loss can train it; without, the rendered field itself
     (one shared network), for density alone and without gradient.
 
     Args:
@@ -35,14 +35,9 @@ class ImportanceSampler(Sampler):
     """
 
     def __init__(
-        self,
-        num_coarse: int = 64,
-        num_fine: int = 64,
-        proposal: RadianceField | None = None,
-        *,
-        box: Tensor | None = None,
-        quadrature: str = "constant",
-    ) -> None:
+        self, num_coarse: int = 64, num_fine: int = 64, proposal: RadianceField | None = None, *,
+        box: Tensor | None = None, quadrature: str = "constant",
+    ) -> None:  # fmt: skip
         super().__init__()
         check_positive("num_fine", num_fine)
         check_choice("quadrature", quadrature, ("constant", "linear"))
@@ -63,7 +58,7 @@ class ImportanceSampler(Sampler):
             held = torch.cat([density[:, :1], density, density[:, -1:]], dim=-1)
             drawn = sample_piecewise_linear(points, held, self.num_fine, **random)
         else:
-            weights = render_weights(density.detach() * coarse.lengths, coarse)
+            weights = render_weights(interval_depths(density.detach(), coarse.lengths), coarse)
             drawn = sample_piecewise_constant(edges, weights, self.num_fine, **random)
         merged = torch.cat([edges, drawn], dim=-1).sort(dim=-1).values
         starts, ends = merged[:, :-1], merged[:, 1:]

@@ -3,17 +3,13 @@
 import torch
 from torch import Tensor
 
-from dnerf.checks import check_positive, check_shape
+from dnerf.core.checks import check_positive, check_shape
 
 
 def sample_piecewise_constant(
-    edges: Tensor,
-    weights: Tensor,
-    num_samples: int,
-    *,
-    randomized: bool = False,
+    edges: Tensor, weights: Tensor, num_samples: int, *, randomized: bool = False,
     generator: torch.Generator | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Draw sorted positions from histograms whose bins hold `weights`.
 
     A total below 1e-5 is filled up evenly, so that a histogram of zeros is sampled uniformly and no division is 0/0;
@@ -42,10 +38,9 @@ def sample_piecewise_constant(
     cdf = torch.cumsum(weights, dim=-1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf / cdf[:, -1:]], dim=-1).contiguous()
     strata = torch.arange(num_samples, dtype=cdf.dtype, device=cdf.device).expand(num_rays, num_samples)
+    within = torch.full_like(cdf[:, :1], 0.5)
     if randomized:
-        within = torch.rand((num_rays, num_samples), generator=generator, dtype=cdf.dtype, device=cdf.device)
-    else:
-        within = torch.full_like(cdf[:, :1], 0.5)
+        within = torch.rand(strata.shape, generator=generator, dtype=cdf.dtype, device=cdf.device)
     # Rounding may take the last stratum to 1, which lies behind every bin, empty last ones included.
     u = ((strata + within) / num_samples).clamp(max=1 - torch.finfo(cdf.dtype).eps / 2).contiguous()
     upper = torch.searchsorted(cdf, u, right=True).clamp(1, num_bins)

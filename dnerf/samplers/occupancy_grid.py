@@ -1,44 +1,55 @@
-"""Cells over space and slabs of time that learn where matter is."""
+"""Cells over space and slabs of time that learn where something is."""
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import as_box, check_positive
+from dnerf.core.checks import as_box, check_positive
 from dnerf.fields.base import RadianceField
 from dnerf.kernels import skip_distances
-from dnerf.samplers.base import Sampler
-from dnerf.samplers.masks import slab_halves, spread_over, widened
+from dnerf.nn.parameter_groups import HasTrainingBuffers
 
 SPACE = (1, 2, 3)  # axes
-NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no picture shows
+PROBES_AT_ONCE = 1 << 18  # of a finished field
+NEGLIGIBLE = 1e-4  # density, in 1 / world unit, that no image shows
 OPAQUE = 1e4  # as what infinite density counts, and what is no number: samples have to see it, and it can decay
 
 
-class OccupancyGrid(Sampler):
-    """What a sampler that looks only where matter is knows of it; how it places samples is left to `OccupancySampler`,
-    which describes the arguments and how cells become occupied.
+class OccupancyGrid(nn.Module, HasTrainingBuffers):
+    """Every cell of every slab of time keeps a decaying maximum of the densities evaluated in it.
+
+    They are those of the training samples themselves (free) and of random probes of the field. A cell is occupied while
+    it, or a neighbour in space or time, is above the smaller of `threshold` and half the mean of all cells. So a thin
+    start empties nothing that was looked at (uniform density is above half its mean), empty space is dropped as soon as
+    something stands out, and neighbours and probes bring back what was lost or lies where nobody has looked yet.
+
+    Sources: instant-ngp (Mueller et al. 2022, appendix C) for the decaying maximum, nerfacc for a threshold that
+    follows the mean; slabs in time and the use of training samples are this project's.
+
+    Args:
+        box: (2, 3) corners of the space that is sampled, in world units.
+        resolution: cells along the box's longest side; cells are nearly cubes.
+        num_slabs: slabs that time is cut into, K.
+        threshold: density, in 1 / world unit, above which a cell is occupied.
+        decay: factor on all maxima at each update.
+        update_every: training steps between updates.
+        num_probes: random cells evaluated at each update.
+        dilation: cells by which occupied regions are widened in space (0 or 1); time is widened by one slab, and in
+            evaluation, if `render_dilation` differs, by the nearer half of one.
+        render_dilation: the same in evaluation mode. Training needs it, for bodies to move into; images of a trained
+            field hardly do, and it is half of their samples. `fill` always takes `dilation`.
 
     Raises:
         ValueError: for numbers out of range.
     """
 
-    observed = ("maxima",)
-
     def __init__(
-        self,
-        box: Sequence[Sequence[float]],
-        resolution: int,
-        *,
-        num_slabs: int,
-        threshold: float,
-        decay: float,
-        update_every: int,
-        num_probes: int,
-        margin: int,
-        render_margin: int,
-    ) -> None:
+        self, box: Sequence[Sequence[float]], resolution: int = 64, *, num_slabs: int = 16, threshold: float = 1.0,
+        decay: float = 0.8, update_every: int = 16, num_probes: int = 1 << 16, dilation: int = 1,
+        render_dilation: int = 1,
+    ) -> None:  # fmt: skip
         super().__init__()
         for name, value in (
             ("resolution", resolution),
@@ -50,58 +61,43 @@ class OccupancyGrid(Sampler):
             check_positive(name, value)
         if not 0 < decay < 1:
             raise ValueError(f"decay must be in (0, 1), got {decay}")
-        for name, value in (("margin", margin), ("render_margin", render_margin)):
+        for name, value in (("dilation", dilation), ("render_dilation", render_dilation)):
             if value not in (0, 1):
                 raise ValueError(f"{name} must be 0 or 1, got {value}")
         corners = as_box(box)
         sides = corners[1] - corners[0]
         cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
-        self.threshold = threshold
-        self.decay = decay
-        self.update_every = update_every
-        self.num_probes = num_probes
-        self.margin = margin
-        self.render_margin = render_margin
-        self.register_buffer("box", corners, persistent=False)
-        self.register_buffer("shape", torch.tensor([num_slabs, *cells]), persistent=False)
-        self.register_buffer("strides", torch.tensor(torch.empty(num_slabs, *cells).stride()), persistent=False)
-        self.register_buffer("maxima", torch.full((num_slabs, *cells), NEGLIGIBLE * 1e-3))
-        self.register_buffer("occupied", torch.ones((num_slabs, *cells), dtype=torch.bool))
-        self.register_buffer("skips", skip_distances(self.occupied), persistent=False)
-        has_own = render_margin != margin
+        self.threshold, self.decay = threshold, decay
+        self.update_every, self.num_probes = update_every, num_probes
+        self.dilation, self.render_dilation = dilation, render_dilation
+        self.box = nn.Buffer(corners, persistent=False)
+        self.shape = nn.Buffer(torch.tensor([num_slabs, *cells]), persistent=False)
+        self.strides = nn.Buffer(torch.tensor(torch.empty(num_slabs, *cells).stride()), persistent=False)
+        self.maxima = nn.Buffer(torch.full((num_slabs, *cells), NEGLIGIBLE * 1e-3))
+        self.occupied = nn.Buffer(torch.ones((num_slabs, *cells), dtype=torch.bool))
+        self.skips = nn.Buffer(skip_distances(self.occupied), persistent=False)
         # Two for each slab: the earlier half is widened by the slab before, the later one by the slab after.
-        halves = torch.ones((2 * num_slabs, *cells), dtype=torch.bool) if has_own else None
+        halves = torch.ones((2 * num_slabs, *cells), dtype=torch.bool) if render_dilation != dilation else None
         self.register_buffer("rendered", halves)
         self.register_buffer("rendered_skips", None if halves is None else skip_distances(halves), persistent=False)
         self.register_load_state_dict_post_hook(_derive)
-        self.box: Tensor
-        self.shape: Tensor
-        self.strides: Tensor
-        self.skips: Tensor
-        self.maxima: Tensor
-        self.occupied: Tensor
         self.rendered: Tensor | None
         self.rendered_skips: Tensor | None
-        self._cells: Tensor | None = None  # numbers of the occupied ones, once asked for
+        self._cells: Tensor | None = None  # numbers of the occupied ones, once wanted
 
-    @property
-    def share(self) -> float:
-        """Share of the cells that pictures look into."""
-        return float((self.occupied if self.rendered is None else self.rendered).float().mean())
-
-    def cells_at_any_time(self) -> tuple[Tensor, Tensor]:
-        """See `Sampler.cells_at_any_time`."""
-        return self.box, self.looked_into(is_narrow=True)[0].any(0)
+    def training_buffers(self) -> tuple[str, ...]:
+        """The maxima, and what training marches through if images do not."""
+        return ("maxima",) if self.rendered is None else ("maxima", "occupied")
 
     def looked_into(self, is_narrow: bool) -> tuple[Tensor, Tensor]:
-        """Occupied cells, those of pictures or those of training, and their skips."""
+        """Occupied cells, those of images or those of training, and their skips."""
         if is_narrow and self.rendered is not None and self.rendered_skips is not None:
             return self.rendered, self.rendered_skips
         return self.occupied, self.skips
 
     @torch.no_grad()
-    def places(self, unit: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions and times in occupied cells (in any, if none is), see `Sampler.places`."""
+    def occupied_positions(self, unit: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions and times in occupied cells (in any, if none is), see `OccupancyAware`."""
         if unit.is_cuda:
             return self._within(spread_over(self.occupied, unit[:, 0]), unit[:, 1:])
         if self._cells is None:
@@ -136,38 +132,29 @@ class OccupancyGrid(Sampler):
         self.decide()
 
     @torch.no_grad()
-    def fill(self, field: RadianceField, probes_per_cell: int = 8, *, chunk: int = 1 << 18) -> None:
+    def fill(self, field: RadianceField, probes_per_cell: int = 8) -> None:
         """Learn a finished field: forget everything, probe every cell at random points, decide what is occupied.
 
-        The picture then differs from the one without occupancy by what lies in cells whose probes (and neighbours')
+        The image then differs from the one without occupancy by what lies in cells whose probes (and neighbours')
         are all below the threshold: at most `1 - exp(-threshold * length)` where the field is that thin.
-
-        Args:
-            field: trained or analytic.
-            probes_per_cell: random points of each cell and slab.
-            chunk: probes at a time.
         """
         self.maxima.fill_(NEGLIGIBLE * 1e-3)
         device = self.maxima.device
         generator = torch.Generator(device).manual_seed(0)
         for _ in range(probes_per_cell):
-            for cells in torch.arange(self.maxima.numel(), device=device).split(chunk):
+            for cells in torch.arange(self.maxima.numel(), device=device).split(PROBES_AT_ONCE):
                 self._probe(field, cells, torch.rand(len(cells), 4, generator=generator, device=device))
         self.decide(is_filled=True)
 
     def decide(self, *, is_filled: bool = False) -> None:
-        """Decide from the maxima which cells are occupied; `fill` and `update` do so themselves.
-
-        Args:
-            is_filled: whether the maxima are those of a finished field, see `fill`.
-        """
+        """Decide from the maxima, which may be those of a finished field (`fill`), which cells are occupied."""
         threshold = (0.5 * self.maxima.mean()).clamp(NEGLIGIBLE, self.threshold)
         dense = self.maxima > threshold
-        occupied = widened(widened(dense, [0]), SPACE if self.margin else [])
+        occupied = widened(widened(dense, [0]), SPACE if self.dilation else [])
         if is_filled or self.rendered is None:
             self._set(occupied, occupied.repeat_interleave(2, dim=0))
         else:
-            self._set(occupied, widened(slab_halves(dense), SPACE if self.render_margin else []))
+            self._set(occupied, widened(slab_halves(dense), SPACE if self.render_dilation else []))
 
     def _probe(self, field: RadianceField, cells: Tensor, within: Tensor) -> None:
         self._enter(cells, field.density(*self._within(cells, within)))
@@ -183,11 +170,7 @@ class OccupancyGrid(Sampler):
 
     @torch.no_grad()
     def occupy(self, mask: Tensor) -> None:
-        """Say which cells are occupied, in training and in evaluation.
-
-        Args:
-            mask: (K, Gx, Gy, Gz) bool, or what broadcasts to it.
-        """
+        """Say by a mask (K, Gx, Gy, Gz), or what broadcasts to it, which cells are occupied."""
         mask = mask.expand(self.occupied.shape)
         self._set(mask, mask.repeat_interleave(2, dim=0))
 
@@ -198,10 +181,36 @@ class OccupancyGrid(Sampler):
         _derive(self)
 
 
-def _derive(grid: nn.Module, incompatible_keys: object = None) -> None:
+def _derive(module: nn.Module, incompatible_keys: object = None) -> None:
     """Derive what is not saved from the occupied cells: a grid's skips; their list on demand."""
-    assert isinstance(grid, OccupancyGrid)
+    grid = cast(OccupancyGrid, module)
     grid._cells = None
     grid.skips.copy_(skip_distances(grid.occupied))
     if grid.rendered is not None and grid.rendered_skips is not None:
         grid.rendered_skips.copy_(skip_distances(grid.rendered))
+
+
+def widened(mask: Tensor, axes: Sequence[int]) -> Tensor:
+    """A mask and its neighbours on both sides along some axes."""
+    for axis in axes:
+        result, size = mask.clone(), mask.shape[axis] - 1
+        result.narrow(axis, 1, size).logical_or_(mask.narrow(axis, 0, size))
+        result.narrow(axis, 0, size).logical_or_(mask.narrow(axis, 1, size))
+        mask = result
+    return mask
+
+
+def slab_halves(mask: Tensor) -> Tensor:
+    """A mask (K, ...) for halves of its slabs (2 K, ...), each with the neighbour that is nearer in time."""
+    before, after = torch.cat([mask[:1], mask[:-1]]), torch.cat([mask[1:], mask[-1:]])
+    return torch.stack([mask | before, mask | after], dim=1).flatten(0, 1)
+
+
+def spread_over(mask: Tensor, unit: Tensor) -> Tensor:
+    """Numbers (N,) of the places of a mask that hold, for shares (N,) in [0, 1) of all of those; of any if none holds.
+
+    It reads nothing from a device, unlike a list of those places.
+    """
+    numbers = mask.view(-1).cumsum(0)
+    found = torch.searchsorted(numbers, (unit * numbers[-1]).long(), right=True)
+    return torch.where(numbers[-1] > 0, found, (unit * len(numbers)).long()).clamp(max=len(numbers) - 1)

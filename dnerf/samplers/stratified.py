@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import as_box, check_positive
+from dnerf.core.checks import as_box, check_positive
+from dnerf.core.geometry import clip_to_box
+from dnerf.core.rays import Rays, Samples
 from dnerf.fields.base import RadianceField
-from dnerf.geometry import clip_to_box
-from dnerf.rays import Rays, Samples
 from dnerf.samplers.base import Sampler
 
 
@@ -28,36 +28,18 @@ class StratifiedSampler(Sampler):
         super().__init__()
         check_positive("num_samples", num_samples)
         self.num_samples = num_samples
-        self.clip = RayClip(box)
+        self.box = None if box is None else nn.Buffer(as_box(box), persistent=False)
 
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Dense samples (R, num_samples)."""
-        near, far = self.clip(rays)
+        near, far = rays.near, torch.maximum(rays.near, rays.far)
+        if self.box is not None:
+            near, far = clip_to_box(rays.origins, rays.directions, near, rays.far, self.box.to(near.dtype))
         steps = torch.linspace(0, 1, self.num_samples + 1, dtype=near.dtype, device=near.device)
         edges = torch.lerp(near[:, None], far[:, None], steps)
         starts, ends = edges[:, :-1], edges[:, 1:]
         points = random_points(starts, ends, generator) if self.training else None
         return Samples(starts, ends, len(rays), points=points)
-
-
-class RayClip(nn.Module):
-    """Shortens rays to a box, if there is one.
-
-    Args:
-        box: (2, 3) or nested lists; None leaves rays as they are.
-    """
-
-    def __init__(self, box: Tensor | None) -> None:
-        super().__init__()
-        self.register_buffer("box", None if box is None else as_box(box), persistent=False)
-        self.box: Tensor | None
-
-    def forward(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Distances (R,) where rays begin and end; equal for rays that miss the box."""
-        if self.box is None:
-            return rays.near, torch.maximum(rays.near, rays.far)
-        box = self.box.to(rays.near.dtype)
-        return clip_to_box(rays.origins, rays.directions, rays.near, rays.far, box)
 
 
 def random_points(starts: Tensor, ends: Tensor, generator: torch.Generator | None) -> Tensor:

@@ -1,13 +1,14 @@
-"""Walking rays front to back in rounds, so that what lies behind opaque matter is never asked for."""
+"""Walking rays front to back in rounds, so that nothing is evaluated behind what is opaque."""
 
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from dnerf.compositing import render_weights, sum_along_rays
+from dnerf.core.compositing import render_weights, sum_along_rays
+from dnerf.core.quadrature import interval_depths
+from dnerf.core.rays import Rays, Samples
 from dnerf.fields.base import RadianceField
-from dnerf.rays import Rays, Samples
 
 Source = Callable[[Tensor, int, int], tuple[Samples, Tensor]]
 Visitor = Callable[[Tensor, Samples, Tensor], Tensor]
@@ -16,14 +17,9 @@ Observer = Callable[[Tensor, Tensor, Tensor], None]
 
 @torch.no_grad()
 def walk_front_to_back(
-    source: Source,
-    rays: Tensor,
-    stop_transmittance: float,
-    visit: Visitor,
-    *,
-    first_round: int = 8,
+    source: Source, rays: Tensor, stop_transmittance: float, visit: Visitor, *, first_round: int = 8,
     most_at_once: int = 1 << 18,
-) -> None:
+) -> None:  # fmt: skip
     """Visit the samples of rays in rounds: the first few of each, twice as many, and so on, until it is opaque.
 
     Source: early ray termination (Levoy 1990), here for whole batches of rays at a time.
@@ -51,23 +47,13 @@ def walk_front_to_back(
 
 
 class PackedRounds:
-    """Packed samples as the source of `walk_front_to_back`.
-
-    Args:
-        samples: N packed samples of R rays.
-        pad_to: rounds are padded to a multiple of so many samples, see `Samples.padded`.
-
-    Attributes:
-        rays: (K,) numbers of the rays that have samples.
-        chosen: (n,) numbers of the samples of the latest round, for visitors.
-    """
+    """Packed samples as the source of `walk_front_to_back`, in rounds padded to a multiple of so many."""
 
     def __init__(self, samples: Samples, pad_to: int = 1) -> None:
-        self.samples = samples
-        self.pad_to = pad_to
+        self.samples, self.pad_to = samples, pad_to
         self.counts = samples.offsets.diff()
-        self.rays = self.counts.nonzero()[:, 0]
-        self.chosen = torch.empty(0, dtype=torch.int64)
+        self.rays = self.counts.nonzero()[:, 0]  # (K,) numbers of those that have samples
+        self.chosen = torch.empty(0, dtype=torch.int64)  # (n,) numbers of the latest round's samples, for visitors
 
     def __call__(self, rays: Tensor, taken: int, size: int) -> tuple[Samples, Tensor]:
         """The samples of some rays from number `taken` on."""
@@ -78,31 +64,21 @@ class PackedRounds:
         shift = (samples.offsets[rays] + taken - offsets[:-1]).index_select(0, local)
         self.chosen = torch.arange(total, device=local.device) + shift
         part = Samples(
-            samples.starts.index_select(0, self.chosen),
-            samples.ends.index_select(0, self.chosen),
-            len(rays),
-            ray_indices=local,
-            points=None if samples.points is None else samples.points.index_select(0, self.chosen),
+            samples.starts.index_select(0, self.chosen), samples.ends.index_select(0, self.chosen), len(rays),
+            ray_indices=local, points=None if samples.points is None else samples.points.index_select(0, self.chosen),
             ray_offsets=offsets,
-        )
+        )  # fmt: skip
         return part.padded(self.pad_to), counts > taken + size
 
 
 @torch.no_grad()
 def visible_weights(
-    samples: Samples,
-    rays: Rays,
-    field: RadianceField,
-    min_weight: float,
-    *,
-    first_round: int = 8,
-    most_at_once: int = 1 << 18,
-    pad_to: int = 1,
-    observe: Observer | None = None,
-) -> Tensor:
-    """Ask the field's density front to back for the samples' weights in the picture.
+    samples: Samples, rays: Rays, field: RadianceField, min_weight: float, *, first_round: int = 8,
+    most_at_once: int = 1 << 18, pad_to: int = 1, observe: Observer | None = None,
+) -> Tensor:  # fmt: skip
+    """Evaluate the field's density front to back for the samples' weights in the image.
 
-    A picture of the samples above `min_weight` alone differs from that of all by at most `min_weight` for each sample
+    An image of the samples above `min_weight` alone differs from that of all by at most `min_weight` for each sample
     in front and `min_weight` for all behind. As a filter before the pass with gradients it is nerfacc's (arXiv
     2305.04966).
 
@@ -113,7 +89,7 @@ def visible_weights(
         min_weight: least weight that counts, in (0, 1); a ray whose transmittance has fallen to this is at its end.
         first_round: samples per ray in the first round, see `walk_front_to_back`.
         most_at_once: samples of all rays in a round, likewise; if there are no more, all may be one.
-        pad_to: the field is asked a multiple of so many points.
+        pad_to: the field is evaluated at a multiple of so many points.
         observe: told positions (n, 3), times (n,) and density (n,) of every round.
 
     Returns:
@@ -128,7 +104,7 @@ def visible_weights(
         density = field.density(positions, times)
         if observe is not None:
             observe(positions, times, density)
-        optical_depth = density * part.lengths
+        optical_depth = interval_depths(density, part.lengths)
         weights = render_weights(optical_depth, part) * part.per_sample(transmittance)
         found[rounds.chosen] = weights[: len(rounds.chosen)]
         return torch.exp(-sum_along_rays(optical_depth, part))
@@ -166,10 +142,7 @@ def joined(samples: Samples, most: int) -> tuple[Samples, Tensor]:
     lasts = torch.cat([leaders[1:] - 1, places[-1:]])
     before = torch.nn.functional.pad(leads.cumsum(0), (1, 0))
     merged = Samples(
-        samples.starts[leaders],
-        samples.ends[lasts],
-        samples.num_rays,
-        ray_indices=samples.ray_indices[leaders],
+        samples.starts[leaders], samples.ends[lasts], samples.num_rays, ray_indices=samples.ray_indices[leaders],
         ray_offsets=before[samples.offsets],
-    )
+    )  # fmt: skip
     return merged, before[1:] - 1

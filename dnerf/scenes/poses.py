@@ -1,15 +1,15 @@
 """Similarity poses: rotation, translation and uniform scale between a body's frame and the world."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from dnerf.geometry import skew
-
-if TYPE_CHECKING:
-    from dnerf.scenes.shapes import Shape
+from dnerf.core.geometry import skew
+from dnerf.core.rays import Rays
+from dnerf.scenes.shapes import Shape, Vector, constant
 
 
 def rotate(matrices: Tensor, vectors: Tensor) -> Tensor:
@@ -21,12 +21,12 @@ def rotate(matrices: Tensor, vectors: Tensor) -> Tensor:
     return x * matrices[..., 0] + y * matrices[..., 1] + z * matrices[..., 2]
 
 
-def turn(axis: tuple[float, float, float], angles: Tensor) -> Tensor:
+def turn(axis: Vector, angles: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) about a fixed axis of any positive length by angles (...,) in radians.
 
     Rodrigues with the axis known: no division by the angle, a tenth of the work of `so3_exp`.
     """
-    direction = torch.tensor(axis, dtype=angles.dtype, device=angles.device)
+    direction = constant(axis, angles)
     direction = direction / direction.norm()
     eye = torch.eye(3, dtype=angles.dtype, device=angles.device)
     sine, versine = torch.sin(angles)[..., None, None], 2 * torch.sin(0.5 * angles)[..., None, None] ** 2
@@ -41,7 +41,7 @@ class Pose:
         rotation: (..., 3, 3).
         translation: (..., 3) in world units.
         scale: (...,) > 0.
-        presence: (...,) 1 while the body is there, 0 while it is not; None for always.
+        presence: (...,) 1 while the body is there, 0 while it is not.
     """
 
     num_pieces: ClassVar[int] = 1
@@ -50,26 +50,23 @@ class Pose:
     rotation: Tensor
     translation: Tensor
     scale: Tensor
-    presence: Tensor | None = None
+    presence: Tensor
 
     @classmethod
-    def identity(cls, times: Tensor) -> "Pose":
-        """The pose that changes nothing, one for each time (...,)."""
+    def at(cls, times: Tensor, **parts: Any) -> Self:
+        """One pose for each time (...,), which changes nothing except by the given parts."""
         eye = torch.eye(3, dtype=times.dtype, device=times.device).expand(*times.shape, 3, 3)
-        return cls(eye, torch.zeros_like(eye[..., 0]), torch.ones_like(times))
+        one = torch.ones_like(times)
+        same = {"rotation": eye, "translation": torch.zeros_like(eye[..., 0]), "scale": one, "presence": one}
+        return cls(**(same | parts))
 
-    def take(self, indices: Tensor) -> "Pose":
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The pose with a function applied to each tensor."""
+        return replace(self, **{n: function(value) for n, value in vars(self).items() if isinstance(value, Tensor)})
+
+    def take(self, indices: Tensor) -> Self:
         """Poses of the given items; a single pose (1,) serves all items and stays single."""
-        if len(self.scale) == 1:
-            return self
-        presence = None if self.presence is None else self.presence[indices]
-        return replace(
-            self,
-            rotation=self.rotation[indices],
-            translation=self.translation[indices],
-            scale=self.scale[indices],
-            presence=presence,
-        )
+        return self if len(self.scale) == 1 else self.map(lambda value: value[indices])
 
     def to_world(self, points: Tensor) -> Tensor:
         """Local points (..., 3) to the world."""
@@ -86,30 +83,19 @@ class Pose:
     def then(self, child: "Pose") -> "Pose":
         """Pose of a frame that is given relative to this one."""
         columns = [rotate(self.rotation, child.rotation[..., i]) for i in range(3)]
-        found = [p for p in (self.presence, child.presence) if p is not None]
         return replace(
-            child,
-            rotation=torch.stack(columns, -1),
-            translation=self.to_world(child.translation),
-            scale=self.scale * child.scale,
-            presence=found[0] * found[-1] if found else None,
-        )
+            child, rotation=torch.stack(columns, -1), translation=self.to_world(child.translation),
+            scale=self.scale * child.scale, presence=self.presence * child.presence,
+        )  # fmt: skip
 
-    def local_lines(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Lines (R, 3) of the world in the body's frame, run through at the same distances."""
-        return self.to_local(origins), self.directions_to_local(directions) / self.scale[..., None]
+    def local_lines(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """Origins and directions (R, 3) of rays in the body's frame, run through at the same distances."""
+        return self.to_local(rays.origins), self.directions_to_local(rays.directions) / self.scale[..., None]
 
-    def spans(
-        self, shape: "Shape", origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def spans(self, shape: Shape, rays: Rays) -> tuple[Tensor, Tensor]:
         """Where rays are inside a shape: distances (R, K) at which they enter and leave, `enter >= leave` for none.
 
-        Args:
-            shape: in the body's frame; convex, so that K = 1 unless the frame is bent.
-            origins: (R, 3) in the world.
-            directions: (R, 3), unit norm.
-            near: (R,) distances before which nothing is asked.
-            far: (R,) distances after which nothing is asked.
+        Spans outside a ray's near and far may be missing. Shapes are convex: K = 1 unless the frame is bent.
         """
-        enter, leave = shape.intersect(*self.local_lines(origins, directions))
+        enter, leave = shape.intersect(*self.local_lines(rays))
         return enter[:, None], leave[:, None]

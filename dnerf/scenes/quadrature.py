@@ -1,4 +1,4 @@
-"""Gauss rules for light absorbed along a ray through matter of constant density.
+"""Gauss rules for light absorbed along a ray through bodies of constant density.
 
 Over an interval of length L and density s the colour reaching the eye is
 
@@ -8,7 +8,7 @@ The n-point Gauss rule of the weight exp(-s t) itself (not of the constant weigh
 a polynomial in t of degree below 2n exactly, however thin or opaque the interval: with one node it is the centroid
 of absorption, for s L -> 0 Gauss-Legendre, for s L -> infinity Gauss-Laguerre. By the separation theorem of
 Chebyshev, Markov and Stieltjes (Szego 1939, theorem 3.41.1) the nodes interlace with the cumulative weights, so the
-rule *is* an alpha-compositing of n sub-intervals, each holding the node where the field is asked.
+rule *is* an alpha-compositing of n sub-intervals, each holding the node where the field is evaluated.
 """
 
 import math
@@ -60,14 +60,9 @@ def _interpolation_table(num_nodes: int) -> Tensor:
 
 
 def _solve_rule(depth: Tensor, num_nodes: int) -> tuple[Tensor, Tensor]:
-    """Gauss rules of exp(-depth x) on [0, 1] by the discretised Lanczos process (Gautschi 2004, section 2.2.3.2).
+    """Nodes (M, n) and inner edges (M, n - 1) of the Gauss rules of exp(-depth x) on [0, 1], for depths (M,) > 0.
 
-    Args:
-        depth: (M,) float64, positive.
-        num_nodes: n.
-
-    Returns:
-        nodes (M, n) and inner edges (M, n - 1).
+    By the discretised Lanczos process (Gautschi 2004, section 2.2.3.2).
     """
     points, masses = _fejer_rule(192)
     mass = masses * torch.exp(-depth[:, None] * points)

@@ -7,9 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dnerf.checks import check_positive
-from dnerf.geometry import ray_box
-from dnerf.scenes.motions import Vector, constant
+from dnerf.core.checks import check_positive
+from dnerf.core.geometry import ray_box
+
+Vector = tuple[float, float, float]
+
+
+def constant(values: Vector, like: Tensor) -> Tensor:
+    """Three numbers as a (3,) tensor with another tensor's device and dtype."""
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
 
 
 class Shape(ABC):
@@ -21,12 +27,12 @@ class Shape(ABC):
         """Lowest and highest corner of the axis-aligned box around it."""
 
     @abstractmethod
-    def contains(self, points: Tensor) -> Tensor:
-        """Whether points (..., 3) lie inside, (...,) bool."""
-
-    @abstractmethod
     def excess(self, points: Tensor) -> Tensor:
         """How far points (..., 3) are outside, (...,): <= 0 inside; it changes by at most 1 per unit of length."""
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Whether points (..., 3) lie inside, (...,) bool."""
+        return self.excess(points) <= 0
 
     @abstractmethod
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -59,17 +65,15 @@ def _ball_crossing(origins: Tensor, directions: Tensor, radius: float) -> tuple[
     """
     squared = (directions * directions).sum(-1)
     parallel = squared == 0
-    squared = torch.where(parallel, torch.ones_like(squared), squared)
+    squared = torch.where(parallel, 1.0, squared)
     middle = -(origins * directions).sum(-1) / squared
     nearest = (origins + middle[..., None] * directions).norm(dim=-1)
     below = (radius - nearest) * (radius + nearest)
-    half = (below.clamp(min=0) / squared).sqrt()
-    infinity = torch.full_like(half, torch.inf)
     # A direction of length zero (a line along a cylinder's axis) is inside all the way, or nowhere.
-    half = torch.where(parallel, infinity, half)
-    middle = torch.where(parallel, torch.zeros_like(middle), middle)
+    half = torch.where(parallel, torch.inf, (below.clamp(min=0) / squared).sqrt())
+    middle = torch.where(parallel, 0.0, middle)
     hits = below > 0
-    return torch.where(hits, middle - half, infinity), torch.where(hits, middle + half, -infinity)
+    return torch.where(hits, middle - half, torch.inf), torch.where(hits, middle + half, -torch.inf)
 
 
 @dataclass(frozen=True)
@@ -83,20 +87,14 @@ class Ball(Shape):
 
     @property
     def bounds(self) -> tuple[Vector, Vector]:
-        """A cube."""
         r = self.radius
         return (-r, -r, -r), (r, r, r)
-
-    def contains(self, points: Tensor) -> Tensor:
-        """Within the radius."""
-        return points.norm(dim=-1) <= self.radius
 
     def excess(self, points: Tensor) -> Tensor:
         """Distance from the surface, with its sign."""
         return points.norm(dim=-1) - self.radius
 
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """The chord."""
         return _ball_crossing(origins, directions, self.radius)
 
     def normals(self, points: Tensor) -> Tensor:
@@ -116,13 +114,8 @@ class Box(Shape):
 
     @property
     def bounds(self) -> tuple[Vector, Vector]:
-        """The box itself."""
         x, y, z = self.half_sizes
         return (-x, -y, -z), (x, y, z)
-
-    def contains(self, points: Tensor) -> Tensor:
-        """Between all three pairs of faces."""
-        return (points.abs() <= constant(self.half_sizes, points)).all(-1)
 
     def excess(self, points: Tensor) -> Tensor:
         """By how much the worst coordinate is beyond its face."""
@@ -162,22 +155,15 @@ class Capsule(Shape):
 
     @property
     def bounds(self) -> tuple[Vector, Vector]:
-        """The box around both end balls."""
-        low = tuple(min(0.0, e) - self.radius for e in self.end)
-        high = tuple(max(0.0, e) + self.radius for e in self.end)
-        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+        (x, y, z), r = self.end, self.radius
+        low = (min(0.0, x) - r, min(0.0, y) - r, min(0.0, z) - r)
+        return low, (max(0.0, x) + r, max(0.0, y) + r, max(0.0, z) + r)
 
     def _split(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Components of vectors (..., 3) along the axis (...,) and across it (..., 3)."""
         axis = constant(self.end, vectors) / self.length
         along = (vectors * axis).sum(-1)
         return along, vectors - along[..., None] * axis
-
-    def contains(self, points: Tensor) -> Tensor:
-        """Within the radius of the segment."""
-        along, across = self._split(points)
-        beyond = along - along.clamp(0, self.length)
-        return torch.hypot(beyond, across.norm(dim=-1)) <= self.radius
 
     def excess(self, points: Tensor) -> Tensor:
         """Distance from the surface, with its sign."""
@@ -186,25 +172,21 @@ class Capsule(Shape):
 
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Hull of the crossings of its three convex parts, two balls and a cylinder: their union is convex."""
-        end = constant(self.end, origins)
         first = _ball_crossing(origins, directions, self.radius)
-        second = _ball_crossing(origins - end, directions, self.radius)
+        second = _ball_crossing(origins - constant(self.end, origins), directions, self.radius)
         (height, across), (rise, sideways) = self._split(origins), self._split(directions)
         tube = _ball_crossing(across, sideways, self.radius)
         level = rise == 0
-        rise = torch.where(level, torch.ones_like(rise), rise)
+        rise = torch.where(level, 1.0, rise)
         low, high = -height / rise, (self.length - height) / rise
-        between = (height >= 0) & (height <= self.length)
-        infinity = torch.full_like(low, torch.inf)
-        unbounded = torch.where(between, infinity, -infinity)
+        # A line across the axis is between the ends all the way, or nowhere.
+        unbounded = torch.where((height >= 0) & (height <= self.length), torch.inf, -torch.inf).to(low.dtype)
         enter = torch.maximum(tube[0], torch.where(level, -unbounded, torch.minimum(low, high)))
         leave = torch.minimum(tube[1], torch.where(level, unbounded, torch.maximum(low, high)))
         hits = leave > enter
-        enter, leave = torch.where(hits, enter, infinity), torch.where(hits, leave, -infinity)
-        return (
-            torch.minimum(enter, torch.minimum(first[0], second[0])),
-            torch.maximum(leave, torch.maximum(first[1], second[1])),
-        )
+        enter, leave = torch.where(hits, enter, torch.inf), torch.where(hits, leave, -torch.inf)
+        enter = torch.minimum(enter, torch.minimum(first[0], second[0]))
+        return enter, torch.maximum(leave, torch.maximum(first[1], second[1]))
 
     def normals(self, points: Tensor) -> Tensor:
         """Away from the axis, bending to the axis towards the tips: a polynomial, the steeper the longer it is."""

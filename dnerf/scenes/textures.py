@@ -8,13 +8,20 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from dnerf.geometry import safe_normalize
-from dnerf.scenes.motions import Vector, constant
+from dnerf.core.geometry import safe_normalize
+from dnerf.scenes.shapes import Vector, constant
 
 Plane = tuple[Vector, float]
 
 LIGHT: Vector = (0.36, 0.48, 0.8)
 """Unit vector towards the light that scenes share unless they say otherwise."""
+SHADE: Vector = (0.5, 0.51, 0.58)
+"""Factor per channel of colour that faces away from the light: bluish, like sky light."""
+
+
+def _along(vectors: Tensor, axis: Vector) -> Tensor:
+    """Inner products (..., 1) of vectors (..., 3) with an axis."""
+    return (vectors * constant(axis, vectors)).sum(-1, keepdim=True)
 
 
 class Texture(ABC):
@@ -31,8 +38,9 @@ class Texture(ABC):
         """
 
     def breaks(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Distances (R, M) along lines at which the colour jumps; may be infinite, need not be sorted."""
-        return origins[:, :0]
+        """Distances (R, M) along lines at which the colour jumps, in any order, some infinite: those of its parts."""
+        parts = [part for part in vars(self).values() if isinstance(part, Texture)]
+        return torch.cat([origins[:, :0], *(part.breaks(origins, directions) for part in parts)], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -42,98 +50,80 @@ class Plain(Texture):
     rgb: Vector
 
     def color(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """The colour, expanded."""
         return constant(self.rgb, points).expand_as(points)
 
 
 @dataclass(frozen=True)
 class Gradient(Texture):
-    """Blend along the normal's direction: `low` where the surface faces against the axis, `high` where along it."""
+    """Linear blend by the normal: `low` where the surface faces against the axis, `high` where along it."""
 
     low: Vector
     high: Vector
     axis: Vector = (0.0, 0.0, 1.0)
 
     def color(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """Linear in the normal."""
-        share = 0.5 + 0.5 * (normals * constant(self.axis, points)).sum(-1, keepdim=True)
+        share = 0.5 + 0.5 * _along(normals, self.axis)
         return torch.lerp(constant(self.low, points), constant(self.high, points), share)
 
 
 @dataclass(frozen=True)
 class Glow(Texture):
-    """Blend from the middle outwards: `core` at the centre, `rim` at the given radius of the body's frame."""
+    """Blend with the squared distance from the centre, from `core` to `rim` at the given radius."""
 
     core: Vector
     rim: Vector
     radius: float
 
     def color(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """Quadratic in the distance from the centre."""
         share = (points * points).sum(-1, keepdim=True) / self.radius**2
         return torch.lerp(constant(self.core, points), constant(self.rim, points), share)
 
 
 @dataclass(frozen=True)
-class Stripes(Texture):
-    """Two textures in turn, one sine wave along an axis.
-
-    Args:
-        first: where the sine is -1.
-        second: where it is 1.
-        wave_vector: 2 pi / wavelength along the axis.
-    """
+class Pattern(Texture):
+    """Two textures in turn."""
 
     first: Texture
     second: Texture
-    wave_vector: Vector
+
+    @abstractmethod
+    def share(self, points: Tensor) -> Tensor:
+        """Share (..., 1) of the second texture at points (..., 3), in [0, 1]."""
 
     def color(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """Sinusoidal blend."""
-        phase = (points * constant(self.wave_vector, points)).sum(-1, keepdim=True)
-        first = self.first.color(points, normals, directions)
-        second = self.second.color(points, normals, directions)
-        return torch.lerp(first, second, 0.5 + 0.5 * torch.sin(phase))
-
-    def breaks(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Those of both."""
-        return torch.cat([t.breaks(origins, directions) for t in (self.first, self.second)], dim=-1)
+        first, second = (texture.color(points, normals, directions) for texture in (self.first, self.second))
+        return torch.lerp(first, second, self.share(points))
 
 
 @dataclass(frozen=True)
-class Checker(Texture):
-    """Two textures in turn: every plane crossed changes from one to the other.
+class Stripes(Pattern):
+    """Two textures in turn along a sine wave, the second at its crests; `wave_vector` has length 2 pi / wavelength."""
 
-    Args:
-        first: where a point lies in front of an even number of planes.
-        second: where the number is odd.
-        planes: (normal, offset) each; a point is in front where normal . x > offset.
-    """
+    wave_vector: Vector
 
-    first: Texture
-    second: Texture
+    def share(self, points: Tensor) -> Tensor:
+        return 0.5 + 0.5 * torch.sin(_along(points, self.wave_vector))
+
+
+@dataclass(frozen=True)
+class Checker(Pattern):
+    """Two textures in turn: the second where normal . x > offset for an odd number of planes (normal, offset)."""
+
     planes: tuple[Plane, ...]
 
-    def _heights(self, vectors: Tensor, index: int) -> Tensor:
-        return (vectors * constant(self.planes[index][0], vectors)).sum(-1)
-
-    def color(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """One of both, by the parity of the number of planes in front of which a point lies."""
-        odd = torch.zeros_like(points[..., 0], dtype=torch.bool)
-        for index, (_, offset) in enumerate(self.planes):
-            odd = odd ^ (self._heights(points, index) > offset)
-        first = self.first.color(points, normals, directions)
-        second = self.second.color(points, normals, directions)
-        return torch.where(odd[..., None], second, first)
+    def share(self, points: Tensor) -> Tensor:
+        odd = torch.zeros_like(points[..., :1], dtype=torch.bool)
+        for normal, offset in self.planes:
+            odd = odd ^ (_along(points, normal) > offset)
+        return odd.to(points.dtype)
 
     def breaks(self, origins: Tensor, directions: Tensor) -> Tensor:
         """Crossings of the planes, and the breaks of both textures."""
-        found = [t.breaks(origins, directions) for t in (self.first, self.second)]
-        for index, (_, offset) in enumerate(self.planes):
-            slope = self._heights(directions, index)
-            parallel = slope == 0
-            distance = (offset - self._heights(origins, index)) / torch.where(parallel, 1.0, slope)
-            found.append(torch.where(parallel, torch.inf, distance)[:, None])
+        found = [super().breaks(origins, directions)]
+        for normal, offset in self.planes:
+            slope = _along(directions, normal)
+            distance = (offset - _along(origins, normal)) / torch.where(slope == 0, 1.0, slope)
+            found.append(torch.where(slope == 0, torch.inf, distance))
         return torch.cat(found, dim=-1)
 
 
@@ -159,22 +149,14 @@ class Lit(Texture):
     Args:
         base: the colour in full light.
         light: unit vector towards the light, in the body's frame.
-        shade: factor per channel facing away; a bluish one looks like sky light.
     """
 
     base: Texture
     light: Vector = LIGHT
-    shade: Vector = (0.5, 0.51, 0.58)
 
     def color(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """The base colour, shaded."""
-        facing = 0.5 + 0.5 * (normals * constant(self.light, points)).sum(-1, keepdim=True)
-        shade = constant(self.shade, points)
+        facing, shade = 0.5 + 0.5 * _along(normals, self.light), constant(SHADE, points)
         return self.base.color(points, normals, directions) * (shade + (1 - shade) * facing**2)
-
-    def breaks(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Those of the base."""
-        return self.base.breaks(origins, directions)
 
 
 @dataclass(frozen=True)
@@ -192,16 +174,11 @@ class Shadowed(Texture):
     strength: float = 0.6
 
     def color(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """The base colour, darker in the spots."""
         color = self.base.color(points, normals, directions)
         for x, y, radius in self.spots:
             squared = (points[..., :1] - x) ** 2 + (points[..., 1:2] - y) ** 2
             color = color * (1 - self.strength * torch.exp(-squared / radius**2))
         return color
-
-    def breaks(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Those of the base."""
-        return self.base.breaks(origins, directions)
 
 
 @dataclass(frozen=True)
@@ -224,12 +201,7 @@ class Glossy(Texture):
     width: float = 0.16
 
     def color(self, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """The base colour and the highlight."""
         half = safe_normalize(constant(self.light, points) - directions)
         squared = ((normals - half) ** 2).sum(-1, keepdim=True)
         color = self.base.color(points, normals, directions)
         return color + self.strength * torch.exp(-squared / self.width**2) * (1 - color)
-
-    def breaks(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Those of the base."""
-        return self.base.breaks(origins, directions)

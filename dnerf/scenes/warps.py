@@ -8,22 +8,23 @@ the ray near the body: the optical depth is off by at most its density times tha
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from dnerf.core.rays import Rays
 from dnerf.scenes.motions import Motion, Wave
 from dnerf.scenes.poses import Pose
-from dnerf.scenes.shapes import Ball, Shape
+from dnerf.scenes.shapes import Ball, Shape, Vector
 
 FIRST_LEVEL, LAST_LEVEL = 5, 43
 """The search begins with 2^5 intervals of a ray and ends with 2^43 of them (those that may hold a crossing)."""
 RESOLUTION = 2.0**-LAST_LEVEL
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WarpedPose(Pose):
     """A pose after a warp of the body's own space: world point = pose(warp(local point)).
 
@@ -34,51 +35,29 @@ class WarpedPose(Pose):
 
     num_pieces: ClassVar[int] = 12
 
-    warp: "Warp | None" = None
-    amount: Tensor | None = None
-
-    def take(self, indices: Tensor) -> "WarpedPose":
-        """Poses of the given items, see `Pose.take`."""
-        if len(self.scale) == 1:
-            return self
-        assert self.amount is not None
-        taken = super().take(indices)
-        assert isinstance(taken, WarpedPose)
-        return replace(taken, amount=self.amount[indices])
+    warp: "Warp"
+    amount: Tensor
 
     def to_world(self, points: Tensor) -> Tensor:
-        """Local points (..., 3) to the world."""
-        assert self.warp is not None
-        assert self.amount is not None
         return super().to_world(self.warp.bend(points, self.amount))
 
     def to_local(self, points: Tensor) -> Tensor:
-        """World points (..., 3) to the straight body's frame."""
-        assert self.warp is not None
-        assert self.amount is not None
-        return self.warp.straighten(super().to_local(points), self.amount)
+        return self.warp.bend(super().to_local(points), -self.amount)
 
     @torch.no_grad()
-    def spans(
-        self, shape: Shape, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def spans(self, shape: Shape, rays: Rays) -> tuple[Tensor, Tensor]:
         """Crossings by search, in float64, see the module's text and `Pose.spans`."""
-        assert self.warp is not None
-        assert self.amount is not None
-        dtype, num_rays = origins.dtype, len(origins)
-        exact = replace(self, **{n: getattr(self, n).double() for n in ("rotation", "translation", "scale", "amount")})
-        origins, directions = origins.double(), directions.double()
+        dtype, num_rays = rays.origins.dtype, len(rays)
+        exact, rays = self.map(Tensor.double), rays.to(torch.float64)
         radius = self.warp.reach(shape)
-        plain = Pose(exact.rotation, exact.translation, exact.scale)
-        low, high = Ball(radius).intersect(*plain.local_lines(origins, directions))
-        low, high = torch.maximum(low, near.double()), torch.minimum(high, far.double())
-        rows = (high > low).nonzero()[:, 0]
-        exact, low, high = exact.take(rows), low[rows], high[rows]
-        assert exact.amount is not None
+        straight = Pose(exact.rotation, exact.translation, exact.scale, exact.presence)
+        low, high = Ball(radius).intersect(*straight.local_lines(rays))
+        rays = replace(rays, near=torch.maximum(low, rays.near), far=torch.minimum(high, rays.far))
+        rows = (rays.far > rays.near).nonzero()[:, 0]
+        exact = exact.take(rows)
         slope = self.warp.stretch(exact.amount, radius) / exact.scale
-        path = _Path(shape, exact, origins[rows], directions[rows], low, high, slope)
-        crossings = path.crossings()
-        enter = torch.full((num_rays, crossings.shape[1] // 2), torch.inf, dtype=torch.float64, device=origins.device)
+        crossings = _Path(shape, exact, rays[rows], slope.expand(len(rows))).crossings()
+        enter = torch.full((num_rays, crossings.shape[1] // 2), torch.inf, dtype=torch.float64, device=low.device)
         leave = -enter
         enter[rows], leave[rows] = crossings[:, 0::2], crossings[:, 1::2]
         leave[leave == torch.inf] = -torch.inf
@@ -87,34 +66,33 @@ class WarpedPose(Pose):
 
 @dataclass(frozen=True)
 class _Path:
-    """Rays (H,) between `low` and `high` past a warped shape, whose excess changes by at most `slope` per unit."""
+    """H rays near a warped shape, whose excess along each changes by at most `slope` (H,) per unit."""
 
     shape: Shape
     pose: WarpedPose
-    origins: Tensor
-    directions: Tensor
-    low: Tensor
-    high: Tensor
+    rays: Rays
     slope: Tensor
+
+    def distances(self, rows: Tensor, shares: Tensor) -> Tensor:
+        """Distances (M,) along rays `rows` (M,) at shares (M,) of their lengths."""
+        return torch.lerp(self.rays.near[rows], self.rays.far[rows], shares)
 
     def excess(self, rows: Tensor, shares: Tensor) -> Tensor:
         """Excess (M,) of rays `rows` (M,) at shares (M,) of their lengths."""
-        distances = torch.lerp(self.low[rows], self.high[rows], shares)
-        points = self.origins[rows] + distances[:, None] * self.directions[rows]
+        points = self.rays.origins[rows] + self.distances(rows, shares)[:, None] * self.rays.directions[rows]
         return self.shape.excess(self.pose.take(rows).to_local(points))
 
     def crossings(self) -> Tensor:
         """Sorted crossings (H, 2K), filled up with infinity; rays that begin or end inside cross at their ends."""
-        num_rays, device = len(self.low), self.low.device
-        count = 1 << FIRST_LEVEL
-        rows = torch.arange(num_rays, device=device).repeat_interleave(count)
-        cells = torch.arange(count, device=device).repeat(num_rays)
-        slope = self.slope.expand(num_rays)
+        num_rays, device = len(self.rays), self.slope.device
+        ends = torch.arange(num_rays, device=device)
+        reach = 0.5 * (self.rays.far - self.rays.near) * self.slope
+        rows = ends.repeat_interleave(1 << FIRST_LEVEL)
+        cells = torch.arange(1 << FIRST_LEVEL, device=device).repeat(num_rays)
         for level in range(FIRST_LEVEL, LAST_LEVEL + 1):
             width = 2.0**-level
-            reach = 0.5 * width * (self.high - self.low) * slope
             # The excess itself is known to rounding only.
-            near_zero = self.excess(rows, (cells.double() + 0.5) * width).abs() <= reach[rows] + 1e-14
+            near_zero = self.excess(rows, (cells.double() + 0.5) * width).abs() <= width * reach[rows] + 1e-14
             rows, cells = rows[near_zero], cells[near_zero]
             if level < LAST_LEVEL:
                 rows = rows.repeat_interleave(2)
@@ -124,12 +102,10 @@ class _Path:
         changes = (first <= 0) != (second <= 0)
         first, second = first[changes], second[changes]
         found_rows, shares = rows[changes], (cells[changes].double() + first / (first - second)) * RESOLUTION
-        ends = torch.arange(num_rays, device=device)
-        for share in (0.0, 1.0):
-            at_end = self.excess(ends, torch.full_like(self.low, share)) <= 0
-            found_rows = torch.cat([found_rows, ends[at_end]])
-            shares = torch.cat([shares, torch.full_like(self.low[at_end], share)])
-        return _in_rows(found_rows, torch.lerp(self.low[found_rows], self.high[found_rows], shares), num_rays)
+        for share in (torch.zeros_like(reach), torch.ones_like(reach)):
+            at_end = self.excess(ends, share) <= 0
+            found_rows, shares = torch.cat([found_rows, ends[at_end]]), torch.cat([shares, share[at_end]])
+        return _in_rows(found_rows, self.distances(found_rows, shares), num_rays)
 
 
 def _in_rows(rows: Tensor, values: Tensor, num_rows: int) -> Tensor:
@@ -145,65 +121,45 @@ def _in_rows(rows: Tensor, values: Tensor, num_rows: int) -> Tensor:
     return table
 
 
+@dataclass(frozen=True)
 class Warp(Motion):
-    """A motion that bends its body's space, without changing volumes."""
+    """A motion that bends its body's space, without changing volumes.
+
+    Args:
+        amount: how much, as a function of time, in the warp's unit. The opposite amount undoes it.
+    """
 
     amount: Wave
 
     def relative(self, times: Tensor) -> WarpedPose:
-        """The warped frame at times (...,)."""
-        identity = Pose.identity(times)
-        return WarpedPose(
-            identity.rotation, identity.translation, identity.scale, warp=self, amount=self.amount(times)
-        )  # fmt: skip
+        return WarpedPose.at(times, warp=self, amount=self.amount(times))
 
     @abstractmethod
     def bend(self, points: Tensor, amount: Tensor) -> Tensor:
-        """Points (..., 3) of the straight body, warped; `amount` (...,) may broadcast."""
-
-    @abstractmethod
-    def straighten(self, points: Tensor, amount: Tensor) -> Tensor:
-        """The inverse of `bend`."""
+        """Points (..., 3) of the straight body, warped; `amount` (...,) may broadcast. `-amount` straightens them."""
 
     @abstractmethod
     def stretch(self, amount: Tensor, radius: float) -> Tensor:
-        """Bound (...,) of how many times longer `straighten` makes a short way within a ball about the origin."""
+        """Bound (...,) of how many times longer `bend` makes a short way within a ball about the origin."""
 
     @abstractmethod
     def reach(self, shape: Shape) -> float:
         """Radius of a ball about the origin that holds a shape however it is warped."""
 
-    def _most(self) -> float:
-        """Bound of the amount at any time."""
-        return abs(self.amount.mean) + sum(abs(a) for a, _, _ in self.amount.harmonics)
 
-
-def _corner(shape: Shape) -> tuple[float, float, float]:
+def _corner(shape: Shape) -> Vector:
     x, y, z = (max(abs(a), abs(b)) for a, b in zip(*shape.bounds))
     return x, y, z
 
 
 @dataclass(frozen=True)
 class Twist(Warp):
-    """Turns every cross-section about the z axis, by an angle that grows along it.
-
-    Args:
-        amount: radians per world unit of z, as a function of time.
-        parent: motion of the frame; the world if None.
-    """
-
-    amount: Wave = field(default_factory=Wave)
-    parent: Motion | None = None
+    """Turns every cross-section about the z axis by amount * z; the amount is in radians per world unit."""
 
     def bend(self, points: Tensor, amount: Tensor) -> Tensor:
-        """Turn by amount * z."""
         x, y, z = points.unbind(-1)
         cosine, sine = torch.cos(amount * z), torch.sin(amount * z)
         return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1)
-
-    def straighten(self, points: Tensor, amount: Tensor) -> Tensor:
-        """Turn back."""
-        return self.bend(points, -amount)
 
     def stretch(self, amount: Tensor, radius: float) -> Tensor:
         """A turn, and the change of the turn: 1 + |amount| radius."""
@@ -218,22 +174,12 @@ class Twist(Warp):
 class Bend(Warp):
     """Shifts every cross-section along x by amount * z^2: a rod along z becomes an arc of a parabola.
 
-    Args:
-        amount: 1 / world unit, half the curvature at the origin, as a function of time.
-        parent: motion of the frame; the world if None.
+    The amount is in 1 / world unit, half the curvature at the origin.
     """
 
-    amount: Wave = field(default_factory=Wave)
-    parent: Motion | None = None
-
     def bend(self, points: Tensor, amount: Tensor) -> Tensor:
-        """Shift along x."""
         x, y, z = points.unbind(-1)
         return torch.stack([x + amount * z * z, y, z], dim=-1)
-
-    def straighten(self, points: Tensor, amount: Tensor) -> Tensor:
-        """Shift back."""
-        return self.bend(points, -amount)
 
     def stretch(self, amount: Tensor, radius: float) -> Tensor:
         """A shear: 1 + 2 |amount| radius."""
@@ -242,4 +188,5 @@ class Bend(Warp):
     def reach(self, shape: Shape) -> float:
         """The corner of the shape, shifted as far as it ever is."""
         x, y, z = _corner(shape)
-        return math.hypot(x + self._most() * z * z, y, z)
+        most = abs(self.amount.mean) + sum(abs(amplitude) for amplitude, _, _ in self.amount.harmonics)
+        return math.hypot(x + most * z * z, y, z)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dnerf.benchmarks.endpoint_rows import endpoint_rows, surface_points
+from benchmarks.endpoint_rows import endpoint_rows, surface_points
 from dnerf.deformations import IdentityDeformation
 from dnerf.scenes import make_scene
 
@@ -41,7 +41,7 @@ def test_points_are_in_one_body_near_its_surface() -> None:
 
 def test_a_scene_without_motion_is_named() -> None:
     scene = make_scene("static")
-    with pytest.raises(ValueError, match=r"matter that moves by 0\.01"):
+    with pytest.raises(ValueError, match=r"points that move by 0\.01"):
         endpoint_rows(scene, scene, num_points=50)
 
 

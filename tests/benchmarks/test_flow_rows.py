@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from dnerf.benchmarks.closed_flows import CLOSED_FLOWS
-from dnerf.benchmarks.flow_rows import smooth_network, solver_rows, variant_rows
+from benchmarks.closed_flows import CLOSED_FLOWS
+from benchmarks.flow_rows import smooth_network, solver_rows, variant_rows
 from dnerf.deformations.solvers import SOLVERS
 
 
@@ -40,10 +40,10 @@ def test_the_network_is_always_the_same_and_moves_points_by_about_half_a_unit() 
 def test_variant_rows_compare_with_the_first() -> None:
     names = (
         "displacement (4 x 128)",
-        "flow, frozen clock, 1 midpoint step (3 x 128)",
+        "flow, stationary, 1 midpoint step (3 x 128)",
         "flow, chain of 2 Euler steps (3 x 128)",
     )
-    rows = variant_rows(names, num_samples=512, num_rays=16, repeats=1, precision=None)
+    rows = variant_rows(names, num_samples=512, repeats=1, precision=None)
     assert [row["variant"] for row in rows] == list(names)
     assert [row["evaluations"] for row in rows] == [1, 2, 2]
     assert rows[0]["ratio"] == 1

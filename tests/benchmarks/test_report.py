@@ -5,9 +5,8 @@ import json
 
 import pytest
 
-from dnerf.benchmarks.plotting import spread_out
-from dnerf.benchmarks.report import show, table_name, write_report
-from dnerf.benchmarks.suite import BarPlot, Plot, Series, SuiteResult, Table
+from benchmarks.report import show, table_name, write_report
+from benchmarks.suite import BarPlot, Plot, Series, SuiteResult, Table
 
 pytest.importorskip("matplotlib")
 
@@ -78,25 +77,6 @@ def test_plot_skips_what_is_not_finite_and_refuses_nonsense(tmp_path):
 def test_tables_are_named_after_their_titles():
     assert table_name(Table("Cost of a step, one core", [])) == "cost_of_a_step_one_core"
     assert table_name(Table("T", [], name="own")) == "own"
-
-
-@pytest.mark.parametrize(
-    ("heights", "expected"),
-    [
-        ([5.0], [5.0]),
-        ([9.0, 1.0], [9.0, 1.0]),
-        ([5.0, 5.0], [4.5, 5.5]),
-        ([0.0, 0.0, 9.0], [0.0, 1.0, 9.0]),
-        ([9.8, 10.0], [9.0, 10.0]),
-        ([3.0, 3.2, 4.4], [2.5333, 3.5333, 4.5333]),
-    ],
-)
-def test_labels_move_apart_as_little_as_possible(heights, expected):
-    assert spread_out(heights, 1.0, 0.0, 10.0) == pytest.approx(expected, abs=1e-3)
-
-
-def test_more_labels_than_fit_share_the_room():
-    assert spread_out([5.0] * 5, 10.0, 0.0, 4.0) == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
 def test_bars_are_drawn_on_both_kinds_of_axis(tmp_path):

@@ -2,18 +2,22 @@
 
 import json
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from dnerf.benchmarks import runs
-from dnerf.benchmarks.needs import Trial, last_of_each, removing, smallest_enough
-from dnerf.benchmarks.runs import run_training
-from dnerf.benchmarks.scenes import scene_overrides
-from dnerf.benchmarks.suite import Settings
-from dnerf.benchmarks.training import run as run_training_suite
+from benchmarks import runs
+from benchmarks.needs import Trial, last_of_each, removing, smallest_enough
+from benchmarks.runs import run_training
+from benchmarks.scenes import scene_overrides
+from benchmarks.suite import Settings
+from benchmarks.training import run as run_training_suite
+from dnerf.training.runs import build
+
+BOX = "[[-1.5,-1.5,-1.5],[1.5,1.5,1.5]]"
 
 SCRIPT = """
 import json, sys
@@ -29,6 +33,7 @@ seconds = float(values.get("trainer.max_seconds", 1))
 metrics = {"psnr": 20 + seconds + int(values.get("seed", 0)), "ssim": 0.5, "train_seconds": seconds, "num_steps": 10,
            "num_parameters": 7, "seconds_per_frame": 0.25, "split": "test", "frames": []}
 (out / "metrics.json").write_text(json.dumps(metrics))
+(out / "model.safetensors").write_bytes(bytes(1 << 18))
 with open(out.parent / "calls.txt", "a") as file:
     file.write(" ".join(sys.argv[1:]) + chr(10))
 """
@@ -48,6 +53,7 @@ def test_memory_is_that_of_this_child_alone(command, tmp_path):
     assert large.peak_mib - small.peak_mib == pytest.approx(200, abs=10)
     assert small.psnr == 21
     assert small.step_ms == 100
+    assert small.model_mib == 0.25
 
 
 def test_a_run_of_the_same_clean_commit_is_not_repeated(command, tmp_path, monkeypatch):
@@ -73,6 +79,7 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     assert len(means) == 8
     row = next(r for r in means if (r["scene"], r["experiment"], r["budget_s"]) == ("static", "dnerf", 8))
     assert (row["psnr"], row["psnr_low"], row["psnr_high"], row["split"], row["frames"]) == (29, 28, 30, "val", 2)
+    assert (row["resolution"], row["model_MiB"]) == (50, 0.25)
     assert [p.name for p in result.plots] == ["training_walker", "training_static"]
     calls = (tmp_path / "work" / "calls.txt").read_text().splitlines()
     assert len(calls) == 17
@@ -149,23 +156,29 @@ def test_an_override_that_is_replaced_is_not_printed():
     assert last_of_each(["a=1", "b=2", "a=null"]) == ["b=2", "a=null"]
 
 
-def test_every_part_of_the_needs_can_be_removed_by_its_overrides():
-    conf = Path(__file__).parents[2] / "conf"
-    section = OmegaConf.load(conf / "benchmark.yaml").needs
-    base = [f"experiment={section.experiment}", *section.full]
-    with initialize_config_dir(str(conf), version_base="1.3"):
-        full = compose("train", base)
-        for name, overrides in section.parts.items():
-            assert compose("train", last_of_each([*base, *overrides])) != full, name
+CONF = Path(__file__).parents[2] / "conf"
+NEEDS = OmegaConf.to_container(OmegaConf.load(CONF / "benchmark.yaml").needs, resolve=True)
 
 
-def test_all_parts_of_the_needs_can_be_removed_together():
-    conf = Path(__file__).parents[2] / "conf"
-    section = OmegaConf.load(conf / "benchmark.yaml").needs
-    assert {name for names in section.includes.values() for name in names} <= set(section.parts)
-    overrides = removing(list(section.parts), section.parts, section.includes)
-    with initialize_config_dir(str(conf), version_base="1.3"):
-        compose("train", last_of_each([f"experiment={section.experiment}", *section.full, *overrides]))
+@cache
+def composed(*overrides):
+    base = [f"experiment={NEEDS['experiment']}", *NEEDS["full"], f"data.box={BOX}"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("train", last_of_each([*base, *overrides]))
+
+
+@pytest.mark.parametrize("names", [*([name] for name in NEEDS["parts"]), list(NEEDS["parts"])], ids=" ".join)
+def test_parts_of_the_needs_can_be_removed_alone_and_together(names):
+    config = composed(*removing(names, NEEDS["parts"], NEEDS["includes"]))
+    assert config != composed()
+    plain = OmegaConf.to_container(config, resolve=True)
+    renderer = build(plain["renderer"])
+    for loss in build(plain["trainer"]["losses"]).values():
+        loss.check(renderer)
+
+
+def test_parts_that_are_gone_with_others_are_parts():
+    assert {name for names in NEEDS["includes"].values() for name in names} <= set(NEEDS["parts"])
 
 
 def test_scenes_are_exact_ones_or_folders(tmp_path):

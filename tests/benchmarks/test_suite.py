@@ -5,13 +5,13 @@ from types import ModuleType
 
 import pytest
 
-from dnerf.benchmarks import Settings, SuiteResult, Table, run_suite, suite, suite_names
+from benchmarks import Settings, SuiteResult, Table, run_suite, suite, suite_names
 
 
 @pytest.fixture
 def module(monkeypatch):
     """A suite of the test's own, as a new file in the package would be."""
-    module = ModuleType("dnerf.benchmarks.made_up", "What it measures.")
+    module = ModuleType("benchmarks.made_up", "What it measures.")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr(suite, "suite_names", lambda: ["made_up"])
     return module

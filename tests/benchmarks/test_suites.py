@@ -5,18 +5,18 @@ import math
 import pytest
 import torch
 
-from dnerf.benchmarks import Settings, run_suite
-from dnerf.benchmarks.kernel_cases import RESOLUTIONS
-from dnerf.benchmarks.machine import Rates
-from dnerf.benchmarks.operations import LAYER, OperationCounter
-from dnerf.benchmarks.plain_kernels import plain_grid_encode, plain_packed_weights
-from dnerf.benchmarks.profile import PARTS
-from dnerf.benchmarks.quadrature import samples_needed
-from dnerf.benchmarks.scaling import measure
-from dnerf.benchmarks.smooth import SmoothClouds, exact_smooth
+from benchmarks import Settings, run_suite
+from benchmarks.kernel_cases import RESOLUTIONS
+from benchmarks.machine import Rates
+from benchmarks.operations import LAYER, OperationCounter
+from benchmarks.plain_kernels import plain_grid_encode, plain_packed_weights
+from benchmarks.profile import PARTS
+from benchmarks.quadrature import samples_needed
+from benchmarks.scaling import measure
+from benchmarks.smooth import SmoothClouds, exact_smooth
+from dnerf.core.rays import Rays
 from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, packed_weights, relu_layers
 from dnerf.kernels.cpu.dense import has_vectors
-from dnerf.rays import Rays
 
 RATES = Rates({torch.float32: 1e9}, bandwidth=1e9, cached_bandwidth=1e9)
 
@@ -84,11 +84,10 @@ def test_products_of_whole_networks_are_counted(monkeypatch):
 
 
 def test_profile_names_the_part_of_every_kernel_that_training_runs():
-    of_pictures = {"dnerf::brick_lookup", "dnerf::trace", "dnerf::trace_network", "dnerf::march_to_size"}
     kernels = {name for name in torch._C._dispatch_get_all_op_names() if name.startswith("dnerf::")}
     named = {name for names in PARTS.values() for name in names}
-    assert of_pictures < kernels
-    assert kernels - of_pictures <= named
+    assert kernels
+    assert kernels <= named
 
 
 def test_updates_in_place_are_written_and_views_are_free():
@@ -127,10 +126,10 @@ def test_truth_of_smooth_clouds_agrees_with_many_samples():
     left = torch.ones(20, dtype=torch.float64)
     for part in middles.split(2000):
         x = rays.origins[:, None] + part[:, None] * rays.directions[:, None]
-        said = field(x, x, rays.times[:, None].expand(20, len(part)))
-        depth = said.density * (t[1] - t[0])
+        output = field(x, x, rays.times[:, None].expand(20, len(part)))
+        depth = output.density * (t[1] - t[0])
         before = torch.exp(-(depth.cumsum(-1) - depth)) * left[:, None]
-        color += ((before * -torch.expm1(-depth))[..., None] * said.rgb).sum(1)
+        color += ((before * -torch.expm1(-depth))[..., None] * output.rgb).sum(1)
         left = left * torch.exp(-depth.sum(-1))
     # The box ends at 1.6, beyond which the clouds are thinner than 1e-4.
     torch.testing.assert_close(truth, color + left[:, None], rtol=0, atol=1e-4)
@@ -139,7 +138,7 @@ def test_truth_of_smooth_clouds_agrees_with_many_samples():
 def test_samples_follow_what_is_occupied_and_not_the_box():
     sizes = {"occupancy_resolution": 48, "grid_resolution": 16, "rays": 300, "extent": 3.0, "occupied": 0.5}
     counts = {
-        name: measure({**sizes, **changes}, 1e-3, 0, "cpu", torch.get_num_threads())["samples"]
+        name: measure({**sizes, **changes}, 1e-3, 0, "cpu")["samples"]
         for name, changes in (("base", {}), ("rays", {"rays": 600}), ("finer", {"occupancy_resolution": 96}))
     }
     assert counts["rays"] == pytest.approx(2 * counts["base"], rel=0.2)

@@ -5,8 +5,8 @@ import time
 import pytest
 import torch
 
-from dnerf.benchmarks.machine import Rates, describe_machine, measure_rates
-from dnerf.benchmarks.timing import fitted_order, num_threads, recorded, summarize, time_in_turn
+from benchmarks.machine import Rates, describe_machine, measure_rates
+from benchmarks.timing import fitted_order, num_threads, recorded, summarize, time_in_turn
 
 
 def test_calls_take_turns_and_the_first_round_does_not_count():

@@ -41,14 +41,8 @@ def make_scene(tmp_path: Path) -> Scene:
         for i in range(num_frames):
             image = Image.fromarray(random_rgba(i, height, width))
             (image if mode == "RGBA" else image.convert(mode)).save(root / split / f"r_{i}.png")
-            manifest["frames"].append(
-                {
-                    "file_path": f"./{split}/r_{i}",
-                    "rotation": 0.1,
-                    "time": i / max(num_frames - 1, 1),
-                    "transform_matrix": pose(i),
-                }
-            )
+            frame = {"file_path": f"./{split}/r_{i}", "rotation": 0.1, "time": i / max(num_frames - 1, 1)}
+            manifest["frames"].append({**frame, "transform_matrix": pose(i)})
         edit(manifest)
         (root / f"transforms_{split}.json").write_text(json.dumps(manifest))
         return root

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -5,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dnerf.cameras import Intrinsics, look_at
+from dnerf.core.cameras import Intrinsics, look_at
 from dnerf.data.frames import Frames, composite_on, is_rigid
 
 INTRINSICS = Intrinsics(5, 4, 6.0, 7.0)
@@ -30,25 +31,20 @@ def test_image_is_premultiplied_colour_plus_what_alpha_lets_through() -> None:
     background = (0.25, 0.5, 1.0)
     image = frames.image(1, background).double()
     raw = frames.images[1].double()
-    for row in range(4):
-        for column in range(5):
-            for c in range(3):
-                see_through = 1 - raw[row, column, 3] / 255
-                expected = raw[row, column, c] / 255 + see_through * background[c]
-                assert abs(image[row, column, c] - expected) < 3e-7  # float32
+    for row, column, c in itertools.product(range(4), range(5), range(3)):
+        see_through = 1 - raw[row, column, 3] / 255
+        expected = raw[row, column, c] / 255 + see_through * background[c]
+        assert abs(image[row, column, c] - expected) < 3e-7  # float32
     assert image.max() <= 1 + 1e-6
 
 
-def test_composite_on_is_exact_where_alpha_is_zero_or_one() -> None:
+def test_composite_on_is_exact_where_alpha_is_zero_or_one_and_takes_a_background_per_pixel() -> None:
     rgba = torch.tensor([[0.0, 0, 0, 0], [0.2, 0.4, 0.6, 1]])
     out = composite_on(rgba, torch.tensor([1.0, 0.5, 0.0]))
     assert torch.equal(out, torch.tensor([[1.0, 0.5, 0.0], [0.2, 0.4, 0.6]]))
-
-
-def test_composite_on_takes_a_background_per_pixel() -> None:
-    rgba, backgrounds = torch.rand(7, 4), torch.rand(7, 3)
-    each = torch.stack([composite_on(rgba[i], backgrounds[i]) for i in range(7)])
-    assert torch.equal(composite_on(rgba, backgrounds), each)
+    many, backgrounds = torch.rand(7, 4), torch.rand(7, 3)
+    each = torch.stack([composite_on(many[i], backgrounds[i]) for i in range(7)])
+    assert torch.equal(composite_on(many, backgrounds), each)
 
 
 @pytest.mark.parametrize(("rgba", "background"), [((2, 3), (3,)), ((2, 4), (4,)), ((), (3,))])
@@ -60,16 +56,24 @@ def test_composite_on_refuses_other_channels(rgba: tuple[int, ...], background: 
 def test_opaque_frames_ignore_the_background_and_have_alpha_one() -> None:
     frames = make_frames(channels=3, background="white")
     assert torch.equal(frames.image(0, (0.0, 1.0, 0.0)), frames.images[0].float() / 255)
-    assert torch.equal(frames.alpha(0), torch.ones(4, 5))
+    assert torch.equal(frames.image(0), frames.images[0].float() / 255)
     rays, rgba = frames.pixels(torch.tensor([0, 59]))
     assert torch.equal(rgba[:, 3], torch.ones(2))
     assert torch.equal(rgba[1, :3], frames.images[2, 3, 4].float() / 255)
     assert len(rays) == 2
 
 
-def test_alpha_is_the_fourth_channel() -> None:
-    frames = make_frames()
-    assert torch.equal(frames.alpha(2), frames.images[2, :, :, 3].float() / 255)
+def test_what_lies_behind_images_with_alpha_is_not_guessed() -> None:
+    with pytest.raises(ValueError, match=r"background must be three numbers .* for images with alpha, got"):
+        make_frames().image(0)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_frames_are_transparent_where_a_pixel_is_not_opaque(channels: int) -> None:
+    frames = make_frames(channels=channels, images=torch.full((3, 4, 5, channels), 255, dtype=torch.uint8))
+    assert not frames.is_transparent
+    frames.images[1, 2, 3] = 254
+    assert frames.is_transparent == (channels == 4)
 
 
 @pytest.mark.parametrize("pixel_origin", ["center", "corner"])
@@ -81,44 +85,34 @@ def test_pixels_are_those_of_each_frames_camera(pixel_origin: str) -> None:
         frame, inside = divmod(index, 20)
         whole = frames.camera(frame).rays(float(frames.times[frame]))
         for name in ("origins", "directions", "times", "near", "far"):
-            torch.testing.assert_close(
-                getattr(rays, name)[position], getattr(whole, name)[inside], rtol=1e-6, atol=1e-6
-            )
+            found, expected = getattr(rays, name)[position], getattr(whole, name)[inside]
+            torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
         row, column = divmod(inside, 5)
         assert torch.equal(rgba[position], frames.images[frame, row, column].float() / 255)
 
 
-def test_pixels_of_no_index_are_no_rays() -> None:
-    rays, rgba = make_frames().pixels(torch.empty(0, dtype=torch.int64))
+def test_pixels_of_no_index_are_no_rays_and_there_are_so_many() -> None:
+    frames = make_frames()
+    rays, rgba = frames.pixels(torch.empty(0, dtype=torch.int64))
     assert len(rays) == 0
     assert rgba.shape == (0, 4)
+    assert (frames.num_pixels, len(frames)) == (60, 3)
 
 
-@pytest.mark.parametrize("index", [60, -1])
-def test_pixels_beyond_the_last_are_refused(index: int) -> None:
-    with pytest.raises(IndexError):
-        make_frames().pixels(torch.tensor([index]))
-
-
-@pytest.mark.parametrize("indices", [torch.zeros(2, 1, dtype=torch.int64), torch.zeros(2)])
-def test_pixels_needs_a_row_of_int64(indices: Tensor) -> None:
-    with pytest.raises(ValueError, match="indices must"):
-        make_frames().pixels(indices)
-
-
-def test_memory_is_one_byte_per_value() -> None:
-    frames = make_frames()
-    assert frames.images.element_size() * frames.images.numel() == 3 * 4 * 5 * 4
-    assert frames.num_pixels == 60
-    assert len(frames) == 3
+@pytest.mark.parametrize(
+    ("indices", "error"),
+    [([60], IndexError), ([-1], IndexError), ([[0], [0]], ValueError), ([0.0, 0.0], ValueError)],
+)
+def test_pixels_beyond_the_last_and_other_than_a_row_of_int64_are_refused(indices: list, error: type) -> None:
+    with pytest.raises(error, match="ind"):
+        make_frames().pixels(torch.tensor(indices))
 
 
 def test_subset_keeps_order_and_everything_else() -> None:
     frames = make_frames(names=("a", "b", "c"), near=0.5, far=9.0)
     part = frames.subset([2, 0, -1])
-    assert torch.equal(part.images, frames.images[[2, 0, 2]])
-    assert torch.equal(part.poses, frames.poses[[2, 0, 2]])
-    assert torch.equal(part.times, frames.times[[2, 0, 2]])
+    for name in ("images", "poses", "times"):
+        assert torch.equal(getattr(part, name), getattr(frames, name)[[2, 0, 2]])
     assert part.names == ("c", "a", "c")
     assert (part.near, part.far, part.intrinsics) == (0.5, 9.0, INTRINSICS)
 
@@ -165,16 +159,12 @@ def bad_pose(**entries: float) -> Tensor:
         ({"near": 6.0, "far": 2.0}, "near and far"),
         ({"background": "white"}, "background must be None"),
         ({"names": ("a",)}, "names must be 3"),
+        ({"channels": 3, "background": "pink"}, "color must be"),
     ],
 )
 def test_what_does_not_fit_is_refused(changes: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_frames(**changes)
-
-
-def test_unknown_background_of_opaque_frames_is_refused() -> None:
-    with pytest.raises(ValueError, match="color must be"):
-        make_frames(channels=3, background="pink")
 
 
 def test_rotations_are_rigid_and_what_is_nearly_one_is_not() -> None:

@@ -25,16 +25,13 @@ def loop_area_average(pixels: np.ndarray, width: int, height: int) -> np.ndarray
     source_height, source_width, channels = pixels.shape
     result = np.empty((height, width, channels), np.uint8)
     area = Fraction(source_height * source_width, height * width)
-    for y in range(height):
-        for x in range(width):
-            for c in range(channels):
-                total = Fraction(0)
-                for j in range(source_height):
-                    for i in range(source_width):
-                        weight = overlap(j, y, source_height, height) * overlap(i, x, source_width, width)
-                        alpha = Fraction(int(pixels[j, i, 3]), 255) if channels == 4 and c < 3 else 1
-                        total += weight * int(pixels[j, i, c]) * alpha
-                result[y, x, c] = int(total / area + Fraction(1, 2))
+    for y, x, c in np.ndindex(height, width, channels):
+        total = Fraction(0)
+        for j, i in np.ndindex(source_height, source_width):
+            weight = overlap(j, y, source_height, height) * overlap(i, x, source_width, width)
+            alpha = Fraction(int(pixels[j, i, 3]), 255) if channels == 4 and c < 3 else 1
+            total += weight * int(pixels[j, i, c]) * alpha
+        result[y, x, c] = int(total / area + Fraction(1, 2))
     return result
 
 
@@ -65,13 +62,10 @@ def test_bands_of_a_large_image_leave_no_seams(size: tuple[int, int]) -> None:
     assert np.abs(averaged - (centers * 255 / 599)[:, None, None]).max() <= 1.0
 
 
-def test_largest_values_do_not_overflow() -> None:
+def test_largest_values_do_not_overflow_and_colour_never_exceeds_alpha() -> None:
     white = np.full((600, 601, 4), 255, np.uint8)
     for size in [(1, 1), (7, 11), (601, 1), (1, 600)]:
         assert (premultiplied_area_average(white, *size) == 255).all()
-
-
-def test_colour_never_exceeds_alpha() -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (60, 70, 4), dtype=np.uint8)
     pixels[..., 0] = 255
     for size in [(70, 60), (35, 30), (33, 17)]:
@@ -86,18 +80,15 @@ def test_enlarging_or_emptying_is_refused(size: tuple[int, int]) -> None:
         premultiplied_area_average(np.zeros((4, 4, 3), np.uint8), *size)
 
 
-def test_straight_alpha_is_undone_exactly_by_premultiplying() -> None:
+def test_straight_alpha_is_undone_exactly_by_premultiplying_and_clamps_colour_above_alpha() -> None:
     """All pairs of colour <= alpha."""
     alpha, color = np.meshgrid(np.arange(256), np.arange(256), indexing="ij")
     valid = color <= alpha
     pixels = np.stack([color, np.zeros_like(color), alpha, alpha], axis=-1)[valid][None].astype(np.uint8)
     again = premultiplied_area_average(straight_alpha(pixels), pixels.shape[1], 1)
     np.testing.assert_array_equal(again, pixels)
-
-
-def test_straight_alpha_clamps_colour_above_alpha() -> None:
-    pixels = np.array([[[101, 100, 0, 100], [1, 0, 0, 0]]], np.uint8)
-    np.testing.assert_array_equal(straight_alpha(pixels), [[[255, 255, 0, 100], [255, 0, 0, 0]]])
+    above = np.array([[[101, 100, 0, 100], [1, 0, 0, 0]]], np.uint8)
+    np.testing.assert_array_equal(straight_alpha(above), [[[255, 255, 0, 100], [255, 0, 0, 0]]])
 
 
 def save(image: Image.Image, path: Path, **options: object) -> Path:
@@ -122,7 +113,7 @@ def test_grey_and_colour_are_expanded(tmp_path: Path, mode: str, has_alpha: bool
     np.testing.assert_array_equal(read(path), expected)
 
 
-def test_palettes_are_expanded_with_their_transparency(tmp_path: Path) -> None:
+def test_palettes_are_expanded_with_their_transparency_and_jpeg_is_read(tmp_path: Path) -> None:
     image = Image.new("P", (4, 3), 1)
     image.putpalette([10, 20, 30, 200, 100, 50])
     opaque = save(image, tmp_path / "opaque.png")
@@ -131,9 +122,6 @@ def test_palettes_are_expanded_with_their_transparency(tmp_path: Path) -> None:
     transparent = save(image, tmp_path / "transparent.png", transparency=1)
     assert read_header(transparent) == (4, 3, True)
     assert (read(transparent) == 0).all()
-
-
-def test_jpeg_is_read(tmp_path: Path) -> None:
     path = save(Image.new("RGB", (4, 3), (200, 100, 50)), tmp_path / "a.jpg", quality=100)
     assert read_header(path) == (4, 3, False)
     assert np.abs(read(path, 3).astype(int) - [200, 100, 50]).max() <= 2  # JPEG's own rounding
@@ -184,10 +172,13 @@ def test_a_palette_image_without_a_palette_is_refused(tmp_path: Path) -> None:
         read_header(path)
 
 
-def test_cmyk_is_refused(tmp_path: Path) -> None:
+def test_cmyk_and_another_size_than_promised_are_refused(tmp_path: Path) -> None:
     path = save(Image.new("CMYK", (4, 3)), tmp_path / "a.jpg")
     with pytest.raises(ValueError, match="image must be grey, palette, RGB or RGBA, got CMYK"):
         read_header(path)
+    path = save(Image.new("RGB", (4, 3)), tmp_path / "a.png")
+    with pytest.raises(ValueError, match="image must be 5 x 3, got 4 x 3"):
+        read_image(path, width=4, height=3, channels=3, size=(5, 3))
 
 
 def test_every_truncation_is_an_error_or_the_whole_picture(tmp_path: Path) -> None:
@@ -232,9 +223,3 @@ def test_missing_file_folder_and_pipe_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.png")
     with pytest.raises(ValueError, match="not a regular file"):
         read_header(tmp_path / "pipe.png")
-
-
-def test_another_size_than_promised_is_refused(tmp_path: Path) -> None:
-    path = save(Image.new("RGB", (4, 3)), tmp_path / "a.png")
-    with pytest.raises(ValueError, match="image must be 5 x 3, got 4 x 3"):
-        read_image(path, width=4, height=3, channels=3, size=(5, 3))

@@ -4,7 +4,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dnerf.deformations import Deformation, deform_along_rays
+from dnerf.deformations import (
+    AlongRaysDeformation,
+    CachedAtTime,
+    CachedDeformation,
+    Deformation,
+    IdentityDeformation,
+    deform_along_rays,
+    unwrapped,
+)
 
 
 class Bend(Deformation):
@@ -39,7 +47,7 @@ def test_where_displacements_are_linear_a_few_evaluations_are_exact() -> None:
     torch.testing.assert_close(moved, bend(positions, times))
 
 
-def test_gradients_to_parameters_are_those_of_asking_everywhere_where_displacements_are_linear() -> None:
+def test_gradients_to_parameters_are_those_of_evaluating_everywhere_where_displacements_are_linear() -> None:
     bend, (positions, times) = Bend(), rays(7, 101)
     weights = torch.randn(positions.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     found = torch.autograd.grad((deform_along_rays(bend, positions, times, 0.1) * weights).sum(), bend.parameters())
@@ -58,16 +66,10 @@ def test_error_falls_with_the_square_of_the_spacing_and_stays_below_its_bound() 
     assert ratios == pytest.approx([4, 4], rel=0.15)  # rows' last parts differ in length
 
 
-def test_scattered_points_are_all_asked() -> None:
+def test_scattered_points_are_all_evaluated() -> None:
     bend, points = Bend(square=1.0), torch.randn(50, 3, dtype=torch.float64)
     times = torch.rand(50, dtype=torch.float64)
     assert torch.equal(deform_along_rays(bend, points, times, 0.1), bend(points, times))
-
-
-def test_the_number_asked_is_rounded_up() -> None:
-    bend, (positions, times) = Bend(), rays(7, 101)
-    deform_along_rays(bend, positions, times, 0.1, pad_to=256)
-    assert bend.num_points == 256
 
 
 def test_no_points_are_no_error() -> None:
@@ -83,6 +85,32 @@ def test_gradients_are_right_by_finite_differences() -> None:
         return torch.func.functional_call(_Along(bend), {"bend.rate": rate, "bend.slope": slope}, (positions, times))
 
     assert torch.autograd.gradcheck(moved, tuple(p.detach().clone().requires_grad_() for p in bend.parameters()))
+
+
+def test_samples_of_a_ray_share_evaluations_in_training_only() -> None:
+    bend, (positions, times) = Bend(), rays(7, 101)
+    along = AlongRaysDeformation(bend, 0.1)
+    exact = bend(positions, times)
+    for is_training in (True, False):
+        bend.num_points = 0
+        torch.testing.assert_close(along.train(is_training)(positions, times), exact)
+        assert bend.num_points == (1024 if is_training else 7)  # 84 samples in training, padded; all rows of seven rays
+    assert unwrapped(along) is bend
+
+
+def test_frames_are_those_of_the_other_deformation() -> None:
+    bend = Bend()
+    assert AlongRaysDeformation(bend, 0.1).at_time(0.3) is bend
+    box = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    assert isinstance(AlongRaysDeformation(CachedDeformation(bend, box, 4), 0.1).at_time(0.3), CachedAtTime)
+    positions, times = rays(2, 5)
+    assert torch.equal(AlongRaysDeformation(IdentityDeformation(), 0.1)(positions, times), positions)
+
+
+@pytest.mark.parametrize("spacing", [0.0, -0.1, float("nan"), float("inf")])
+def test_a_spacing_that_is_not_positive_is_refused(spacing: float) -> None:
+    with pytest.raises(ValueError, match="spacing must be > 0 and finite"):
+        AlongRaysDeformation(Bend(), spacing)
 
 
 class _Along(nn.Module):

@@ -7,27 +7,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from dnerf.deformations.velocities import (
-    BoxWindow,
-    CurlVelocity,
-    GridVelocity,
-    NetworkVelocity,
-    RigidVelocity,
-    Velocity,
-)
+from dnerf.deformations.velocities import BoxWindow, CurlVelocity, NetworkVelocity, RigidVelocity, Velocity
 from dnerf.deformations.velocities.base import smooth_step_coefficients
 
 BOX = ((-1.0, -2.0, -1.5), (1.0, 2.0, 0.5))
 VELOCITIES: dict[str, Callable[[], Velocity]] = {
     "network": lambda: NetworkVelocity(BOX, 2, 16),
     "network, relu": lambda: NetworkVelocity(BOX, 1, 16, activation="relu", smoothness=1),
-    "network, twists": lambda: NetworkVelocity(BOX, 2, 16, twists=0.3),
-    "grid": lambda: GridVelocity(BOX, 4, 5),
-    "grid and network": lambda: GridVelocity(BOX, 4, 5, hidden_features=8),
     "curl": lambda: CurlVelocity(BOX, 8, 16),
     "rigid": lambda: RigidVelocity(BOX, 4, 16),
 }
-SMOOTH = ("network", "network, twists", "curl", "rigid")
+SMOOTH = ("network", "curl", "rigid")
 every_velocity = pytest.mark.parametrize("name", VELOCITIES)
 
 
@@ -98,7 +88,7 @@ def test_times_beyond_the_film_are_finite(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["network", "network, relu", "curl", "rigid"])
-def test_no_value_is_asked_for(name: str) -> None:
+def test_no_value_is_read(name: str) -> None:
     """Nor in the backward pass, which a dispatch mode would divert: CUDA graphs could not record it."""
     velocity = trained(name)
     positions, times = points(4)
@@ -161,18 +151,6 @@ def test_one_rigid_cluster_keeps_distances() -> None:
     torch.testing.assert_close(jacobian + jacobian.mT, torch.zeros_like(jacobian), rtol=0, atol=1e-12)
 
 
-def test_a_twist_that_is_the_same_everywhere_turns_a_rigid_body() -> None:
-    velocity = NetworkVelocity(BOX, 2, 16, twists=0.3).double()
-    twist = torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6], dtype=torch.float64)
-    with torch.no_grad():
-        velocity.mlp.output.bias += twist
-    positions, times = points(50)
-    center = velocity.window.center
-    positions = 0.5 * (positions - center) + center
-    expected = twist[:3] + 0.3 * torch.linalg.cross(twist[3:].expand(50, 3), positions - center)
-    torch.testing.assert_close(velocity(positions, times), expected, rtol=0, atol=1e-12)
-
-
 def test_rigid_clusters_move_their_own_neighbourhoods() -> None:
     velocity = RigidVelocity(BOX, 2, 16, radius=0.1).double()
     with torch.no_grad():
@@ -186,25 +164,11 @@ def test_rigid_clusters_move_their_own_neighbourhoods() -> None:
     torch.testing.assert_close(velocity(near, torch.rand(2).double()), expected, rtol=0, atol=1e-12)
 
 
-def test_grid_velocity_is_linear_between_its_values() -> None:
-    velocity = GridVelocity(BOX, 4, 3).double()
-    torch.nn.init.normal_(velocity.values)
-    lattice = velocity.lattice
-    indices = torch.arange(lattice.num_knots * lattice.num_vertices)
-    positions, times = lattice.place(indices)
-    inside = velocity.window(positions.double())[:, 0] > 0
-    read = velocity(positions.double(), times.double())
-    expected = velocity.window(positions.double()) * velocity.values.reshape(-1, 4)[:, :3]
-    # Vertices are placed in float32.
-    torch.testing.assert_close(read[inside], expected[inside], rtol=0, atol=1e-5)
-    assert inside.sum() == 9  # cells of one unit: one column of three vertices at each of three knots
-
-
 @pytest.mark.parametrize("smoothness", range(5))
 def test_window_is_a_smooth_step_of_its_order(smoothness: int) -> None:
     window = BoxWindow(BOX, 0.25, smoothness).double()
-    margin = 0.25
-    line = torch.linspace(1 - margin - 0.01, 1.01, 300, dtype=torch.float64, requires_grad=True)
+    fade = 0.25
+    line = torch.linspace(1 - fade - 0.01, 1.01, 300, dtype=torch.float64, requires_grad=True)
     centre = window.center.double()
     positions = torch.stack([line, centre[1].expand_as(line), centre[2].expand_as(line)], dim=-1)
     value = window(positions)[:, 0]
@@ -212,7 +176,7 @@ def test_window_is_a_smooth_step_of_its_order(smoothness: int) -> None:
     assert value[0] == 1
     assert value[-1] == 0
     # The Beta integral that the polynomial is, from its definition.
-    u = ((1 - line.detach()) / margin).clamp(0, 1)
+    u = ((1 - line.detach()) / fade).clamp(0, 1)
     n = smoothness
     grid = torch.linspace(0, 1, 20001, dtype=torch.float64)
     density = (grid * (1 - grid)) ** n
@@ -225,7 +189,7 @@ def test_window_is_a_smooth_step_of_its_order(smoothness: int) -> None:
         (derivative,) = torch.autograd.grad(derivative.sum(), line, create_graph=True)
         # Zero at both ends of the fading layer: no jump to what is constant beyond.
         assert derivative[line > 1].abs().max() == 0
-        edge = derivative[(line - (1 - margin)).abs().argmin()].abs()
+        edge = derivative[(line - (1 - fade)).abs().argmin()].abs()
         assert edge <= 0.2 * derivative.abs().max()
 
 
@@ -246,21 +210,14 @@ def test_smooth_step_coefficients_are_the_known_ones() -> None:
     assert smooth_step_coefficients(4) == [126, -420, 540, -315, 70]
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: BoxWindow(BOX, 0.0), "margin must be > 0"),
-        (lambda: BoxWindow(BOX, 1.5), r"margin must be in \(0, 1\]"),
-        (lambda: BoxWindow(BOX, 0.5, 5), r"smoothness in 0\.\.4"),
-        (lambda: GridVelocity(BOX, 4, 1), "num_knots must be at least 2"),
-        (lambda: CurlVelocity(BOX, 0), "num_waves must be > 0"),
-        (lambda: RigidVelocity(BOX, 0), "num_clusters must be > 0"),
-        (lambda: RigidVelocity(BOX, radius=math.inf), "radius must be > 0 and finite"),
-        (lambda: NetworkVelocity(BOX, 0), "num_layers must be > 0"),
-        (lambda: NetworkVelocity(BOX, twists=-1.0), "twists must be >= 0"),
-        (lambda: NetworkVelocity(BOX, activation="sine"), "activation must be one of relu, silu, softplus"),
-    ],
-)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: BoxWindow(BOX, 0.0), "fade must be > 0"), (lambda: BoxWindow(BOX, 1.5), r"fade must be in \(0, 1\]"),
+    (lambda: BoxWindow(BOX, 0.5, 5), r"smoothness in 0\.\.4"), (lambda: CurlVelocity(BOX, 0), "num_waves must be > 0"),
+    (lambda: RigidVelocity(BOX, 0), "num_clusters must be > 0"),
+    (lambda: RigidVelocity(BOX, radius=math.inf), "radius must be > 0 and finite"),
+    (lambda: NetworkVelocity(BOX, 0), "num_layers must be > 0"),
+    (lambda: NetworkVelocity(BOX, activation="sine"), "activation must be one of relu, silu, softplus"),
+])  # fmt: skip
 def test_bad_settings_are_refused(make: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()

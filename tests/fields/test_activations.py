@@ -8,17 +8,6 @@ import torch
 from dnerf.fields.activations import DENSITY_ACTIVATIONS, activate_density, truncated_exp
 
 
-@pytest.mark.parametrize("activation", DENSITY_ACTIVATIONS)
-def test_densities_and_gradients_are_finite_for_any_raw_output(activation: str) -> None:
-    raw = torch.tensor([-1e30, -200.0, -20, 0, 14.9, 15.1, 88, 100, 1e30], requires_grad=True)
-    density = activate_density(raw, activation, -1.0)
-    density.sum().backward()
-    assert (density >= 0).all()
-    assert torch.isfinite(density).all()
-    assert torch.isfinite(raw.grad).all()
-    assert (density.diff() >= 0).all()
-
-
 @pytest.mark.parametrize("raw", [-80.0, -20.0, -1.0, 0.0, 3.0, 14.0])
 @pytest.mark.parametrize("shift", [0.0, -1.0])
 def test_densities_have_their_formula(raw: float, shift: float) -> None:

@@ -1,25 +1,24 @@
 """What every radiance field must do. A new one is one line in `FIELDS`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from dnerf.core.compositing import FieldOutput
 from dnerf.deformations import DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField, SpaceTimeVolumes
+from dnerf.fields.base import TimeDependence, field_at_time
 
 
 @dataclass(frozen=True)
 class Case:
-    """How to build a small field, whether its colour depends on the viewing direction, how many contents it has, and
-    whether it has more to say."""
+    """How to build a small field, and whether its colour depends on the viewing direction."""
 
     make: Callable[[], RadianceField]
     view_dependent: bool = False
-    num_contents: int = 0
-    has_changes: bool = False
 
 
 def small_nerf(view_dependent: bool = False, density_activation: str = "softplus") -> NeRFField:
@@ -33,36 +32,32 @@ def small_displacement() -> DisplacementDeformation:
     return DisplacementDeformation(2, 16, (), position_frequencies=3, time_frequencies=3)
 
 
-def small_grid(time_frequencies: int | None = None, view_degree: int | None = None, time_terms: int = 1) -> GridField:
-    return GridField(
-        [[-1, -1.5, -1], [1, 1.5, 2]], (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1,
-        time_frequencies=time_frequencies, view_degree=view_degree, time_terms=time_terms,
-    )  # fmt: skip
+def small_grid(**options: int) -> GridField:
+    box = [[-1, -1.5, -1], [1, 1.5, 2]]
+    return GridField(box, (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1, **options)
 
 
 def small_space_time(view_degree: int | None = None) -> GridField:
     box = [[-1, -1.5, -1], [1, 1.5, 2]]
     volumes = SpaceTimeVolumes(box, (4, 8), (3, 5), num_features=2)
     return GridField(
-        box, (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1, time_terms=3, space_time=volumes,
+        box, (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1, temporal_terms=3, space_time=volumes,
         view_degree=view_degree,
     )  # fmt: skip
 
 
 FIELDS = {
-    "nerf": Case(small_nerf, num_contents=4),
-    "nerf, exp density": Case(lambda: small_nerf(density_activation="exp"), num_contents=4),
+    "nerf": Case(small_nerf), "nerf, exp density": Case(lambda: small_nerf(density_activation="exp")),
     "nerf, view-dependent": Case(lambda: small_nerf(view_dependent=True), view_dependent=True),
-    "grid": Case(small_grid, num_contents=4),
-    "grid, changing": Case(lambda: small_grid(time_terms=3), num_contents=12),
-    "grid, changing and view-dependent": Case(lambda: small_grid(view_degree=2, time_terms=3), True),
-    "grid, space-time": Case(small_space_time, num_contents=12, has_changes=True),
+    "grid": Case(small_grid), "grid, changing": Case(lambda: small_grid(temporal_terms=3)),
+    "grid, changing and view-dependent": Case(lambda: small_grid(view_degree=2, temporal_terms=3), True),
+    "grid, space-time": Case(small_space_time),
     "grid, space-time and view-dependent": Case(lambda: small_space_time(2), True),
     "grid, timed and view-dependent": Case(lambda: small_grid(time_frequencies=3, view_degree=2), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),
     "deformed, view-dependent": Case(lambda: DeformedField(small_displacement(), small_nerf(True)), True),
-}
+}  # fmt: skip
 
 every_field = pytest.mark.parametrize("name", FIELDS)
 VIEW_INDEPENDENT = [name for name, case in FIELDS.items() if not case.view_dependent]
@@ -121,7 +116,7 @@ def test_the_field_of_one_time_is_the_field_at_that_time(name: str) -> None:
     for time in (0.0, 0.37, 1.0):
         times.fill_(time)
         with torch.no_grad():
-            expected, frozen = field(positions, directions, times), field.at_time(time)
+            expected, frozen = field(positions, directions, times), field_at_time(field, time)
         output = frozen(positions, directions, times)
         torch.testing.assert_close(output.density, expected.density, rtol=1e-9, atol=0)
         torch.testing.assert_close(output.rgb, expected.rgb, rtol=1e-9, atol=0)
@@ -168,7 +163,7 @@ def test_gradients_are_alive_at_the_start(name: str) -> None:
     field = FIELDS[name].make()
     output = field(*some_points(200))
     assert (output.density > 0).all()
-    # Thin at the start, or every picture is a wall: below 1 / world unit on average.
+    # Thin at the start, or every image is a wall: below 1 / world unit on average.
     assert output.density.mean() < 1
     (output.density.sum() + output.rgb.sum()).backward()
     assert all(torch.isfinite(p.grad).all() for p in field.parameters() if p.grad is not None)
@@ -216,16 +211,6 @@ def test_bfloat16_autocast_is_close_to_float32(name: str) -> None:
 
 
 @every_field
-def test_field_is_deterministic(name: str) -> None:
-    field = trained(name)
-    points = some_points(30)
-    first = field(*points)
-    second = field.eval()(*points)
-    assert torch.equal(first.density, second.density)
-    assert torch.equal(first.rgb, second.rgb)
-
-
-@every_field
 @pytest.mark.parametrize("shape", [(4, 1), (), (1,), (5,)])
 def test_times_of_another_shape_are_named(name: str, shape: tuple[int, ...]) -> None:
     field = FIELDS[name].make()
@@ -247,62 +232,46 @@ def test_directions_of_another_shape_are_named(name: str, shape: tuple[int, ...]
 
 
 @every_field
-def test_contents_say_all_that_the_field_says(name: str) -> None:
+def test_a_field_that_says_it_is_static_is(name: str) -> None:
     field = trained(name)
-    positions, directions, times = some_points(4, 9)
-    assert field.num_contents == FIELDS[name].num_contents
-    assert field.has_changes == FIELDS[name].has_changes
-    if not field.num_contents:
-        for ask in (lambda: field.contents(positions), lambda: field.from_contents(positions, times)):
-            with pytest.raises(ValueError, match="has no contents"):
-                ask()
+    if not isinstance(field, TimeDependence):
         return
-    contents = field.contents(positions)
-    assert contents.shape == (4, 9, field.num_contents)
-    if field.has_changes:
-        return
-    said, output = field.from_contents(contents, times), field(positions, directions, times)
-    assert torch.equal(said.density, output.density)
-    assert torch.equal(said.rgb, output.rgb)
-    moment = torch.tensor(0.3)
-    one, same = field.from_contents(contents, moment), field(positions, directions, moment.expand(4, 9))
-    torch.testing.assert_close(one.density, same.density)
-    torch.testing.assert_close(one.rgb, same.rgb)
+    positions, directions, times = some_points(50)
+    first, last = (field(positions, directions, t) for t in (times, 1 - times))
+    assert field.is_static == (torch.equal(first.density, last.density) and torch.equal(first.rgb, last.rgb))
 
 
-@pytest.mark.parametrize("name", [name for name, case in FIELDS.items() if case.num_contents])
-def test_contents_that_do_not_fit_are_refused(name: str) -> None:
-    field, contents = trained(name), torch.zeros(5, FIELDS[name].num_contents)
-    with pytest.raises(ValueError, match="positions must"):
-        field.contents(torch.zeros(5, 1))
-    with pytest.raises(ValueError, match="contents must have shape"):
-        field.from_contents(torch.zeros(5, 7), torch.zeros(5))
-    with pytest.raises(ValueError, match=r"times must have shape \(\) or \(5,\)"):
-        field.from_contents(contents, torch.zeros(5, 1))
+class Grey(GridField):
+    """A grid field whose colour is another one: what images show, too."""
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        return replace(super().forward(positions, directions, times), rgb=torch.full_like(positions, 0.25))
 
 
-@every_field
-def test_contents_add_up_as_the_field_says(name: str) -> None:
-    field = trained(name)
-    series = field.series_at(0.3)
-    if series is None:
-        assert not isinstance(field, GridField) or not field.num_contents
-        return
-    positions, directions, _ = some_points(4, 9)
-    waves, shift = series
-    terms, moments = field.contents(positions).unflatten(-1, (4, len(waves))) @ waves, torch.full((4, 9), 0.3)
-    if field.has_changes:
-        changes = field.changes(positions, moments)
-        assert changes.abs().max() > 1e-3
-        terms = terms + changes
-    output = field(positions, directions, moments)
-    torch.testing.assert_close(output.density, torch.exp((terms[..., 0] + shift).clamp(max=15)), rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(output.rgb, torch.sigmoid(terms[..., 1:]), rtol=1e-5, atol=1e-6)
+class Half(GridField):
+    """A grid field of half the density."""
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        return 0.5 * super().density(positions, times)
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        output = super().forward(positions, directions, times)
+        return replace(output, density=0.5 * output.density)
 
 
-@every_field
-def test_changes_of_a_field_without_or_of_shapes_that_do_not_fit_are_refused(name: str) -> None:
-    field = trained(name)
-    message = "times must" if field.has_changes else "has no changes beside its contents"
-    with pytest.raises(ValueError, match=message):
-        field.changes(torch.zeros(5, 3), torch.zeros(5, 1))
+class Same(GridField):
+    """A grid field by another name, whose shortcut holds."""
+
+
+@pytest.mark.parametrize("kind", [Grey, Half])
+def test_overrides_of_subclasses_hold_for_the_field_of_one_time(kind: type[GridField]) -> None:
+    box, (positions, directions, times) = [[-2.0] * 3, [2.0] * 3], some_points(50)
+    times.fill_(0.3)
+    grid = kind(box, (4, 9), 2, temporal_terms=3)
+    for field in (grid, DeformedField(IdentityDeformation(), grid), DeformedField(small_displacement(), grid)):
+        frozen, expected = field_at_time(field, 0.3), field(positions, directions, times)
+        assert torch.equal(frozen(positions, directions, times).rgb, expected.rgb)
+        assert torch.equal(frozen.density(positions, times), expected.density)
+    assert field_at_time(grid, 0.3) is grid
+    same = Same(box, (4, 9), 2)
+    assert field_at_time(same, 0.3) is not same

@@ -7,6 +7,7 @@ import torch
 
 from dnerf.fields import GridField, SpaceTimeVolumes
 from dnerf.fields.grid import GridFieldAtTime
+from dnerf.kernels import grid_network, shade
 
 BOX = [[-1.0, 0.0, 2.0], [1.0, 1.0, 6.0]]
 
@@ -61,7 +62,7 @@ def test_time_features_let_a_place_change_with_time() -> None:
 @pytest.mark.parametrize("view_degree", [None, 1])
 def test_density_and_colour_follow_cosine_series_that_begin_constant(view_degree: int | None) -> None:
     """Before their activations, values at six times determine three cosines, and those the values at all others."""
-    field = small(time_terms=3, view_degree=view_degree).double()
+    field = small(temporal_terms=3, view_degree=view_degree).double()
     positions = (torch.rand(20, 1, 3) + torch.tensor([0.0, 0.0, 3.0])).double().expand(20, 41, 3)
     times = torch.linspace(0, 1, 41, dtype=torch.float64).expand(20, 41)
     fresh = field(positions, positions, times)
@@ -77,15 +78,11 @@ def test_density_and_colour_follow_cosine_series_that_begin_constant(view_degree
     assert (found[:, 1:].abs().amax((0, 1)) > 1e-3).all()
 
 
-@pytest.mark.parametrize(
-    ("box", "options", "message"),
-    [
-        ([[0, 0, 0], [1, 0, 1]], {}, "box must have finite corners"),
-        (BOX, {"num_features": 0}, "num_features must be > 0"),
-        (BOX, {"time_terms": 0}, "time_terms must be > 0"),
-        (BOX, {"resolutions": ()}, "resolutions"),
-    ],
-)
+@pytest.mark.parametrize(("box", "options", "message"), [
+    ([[0, 0, 0], [1, 0, 1]], {}, "box must have finite corners"),
+    (BOX, {"num_features": 0}, "num_features must be > 0"), (BOX, {"temporal_terms": 0}, "temporal_terms must be > 0"),
+    (BOX, {"resolutions": ()}, "resolutions"),
+])  # fmt: skip
 def test_bad_grids_are_refused(box: list, options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         GridField(box, **options)
@@ -136,17 +133,38 @@ def test_a_window_outside_the_training_is_refused(end: float) -> None:
         small(window_end=end)
 
 
-def test_series_are_summed_up_for_pictures_where_there_are_any() -> None:
-    for options in ({"view_degree": 1}, {"time_terms": 3, "view_degree": 1}, {"time_terms": 3, "time_frequencies": 2}):
+def test_series_are_summed_up_for_images_where_there_are_any() -> None:
+    for options in (
+        {"view_degree": 1},
+        {"temporal_terms": 3, "view_degree": 1},
+        {"temporal_terms": 3, "time_frequencies": 2},
+    ):
         field = small(**options)
         assert field.at_time(0.3) is field
-    frozen = small(time_terms=3).at_time(0.3)
+    frozen = small(temporal_terms=3).at_time(0.3)
     assert isinstance(frozen, GridFieldAtTime)
     assert frozen.weight.shape == (4, 16)  # of the head's sixteen to density and colour, not to 4 x 3 terms
-    with pytest.raises(ValueError, match="must have contents"):
+    with pytest.raises(ValueError, match="field must be one whose head sees neither times nor directions"):
         GridFieldAtTime(small(view_degree=1), 0.3)
     with pytest.raises(ValueError, match=r"times must all be 0\.3, got values from 0\.5 to 0\.5"):
         frozen.density(torch.zeros(4, 3), torch.full((4,), 0.5))
+
+
+def test_tables_for_the_frame_kernel_are_all_that_the_field_shows() -> None:
+    field = small(temporal_terms=3, window_end=1.0)
+    field.set_progress(0.6)
+    torch.nn.init.normal_(field.head.output.weight)
+    tables = field.at_time(0.3).network_tables()
+    positions = torch.lerp(*torch.tensor(BOX), torch.rand(50, 3))
+    unit = (positions - tables.low) * tables.scale
+    raw = grid_network(unit, tables.table, tables.levels, tables.weights, tables.biases)
+    density, rgb = shade(raw, tables.shifts, 0.0)
+    expected = field(positions, positions, torch.full((50,), 0.3))
+    torch.testing.assert_close(density, expected.density, rtol=1e-4, atol=0)
+    torch.testing.assert_close(rgb, expected.rgb, rtol=0, atol=1e-5)
+    volumes = SpaceTimeVolumes(BOX, (4,), (3,))
+    for options in ({"density_activation": "softplus"}, {"space_time": volumes}):
+        assert small(**options).at_time(0.3).network_tables() is None
 
 
 def test_what_is_no_level_is_seen_whatever_the_window() -> None:

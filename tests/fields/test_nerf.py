@@ -31,12 +31,6 @@ def test_density_shift_thins_the_start() -> None:
     assert thin < 0.05 < thick
 
 
-def test_unknown_activation_is_named() -> None:
-    field = NeRFField(2, 16, (), density_activation="relu")
-    with pytest.raises(ValueError, match="activation must be one of softplus, exp; got 'relu'"):
-        field.density(torch.zeros(1, 3), torch.zeros(1))
-
-
 def test_a_trunk_without_layers_is_refused() -> None:
     with pytest.raises(ValueError, match="num_layers must be > 0"):
         NeRFField(num_layers=0)

@@ -14,7 +14,7 @@ AXES = ((0, 1), (0, 2), (1, 2))
 
 
 def filled(std: float = 0.5, dtype: torch.dtype = torch.float64) -> SpaceTimeVolumes:
-    """Volumes with contents, of two levels: cells of a unit and of a half, two and four moments apart."""
+    """Volumes of random features, of two levels: cells of a unit and of a half, two and four of them in time."""
     volumes = SpaceTimeVolumes(BOX, (4, 8), (2, 4), num_features=3).to(dtype)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -80,9 +80,9 @@ def test_a_body_is_where_its_three_tubes_meet() -> None:
             for k in range(5):  # at time k / 4 the body is at vertex (k, k, k)
                 table[k + 5 * (k + 5 * k)] = 1  # and of 2 in it
             assert levels.num_rows == 125
-    moments = torch.arange(5) / 4
-    for k, time in enumerate(moments):
-        places = torch.cartesian_prod(moments, moments, moments)
+    steps = torch.arange(5) / 4
+    for k, time in enumerate(steps):
+        places = torch.cartesian_prod(steps, steps, steps)
         found = volumes(places, time.expand(len(places)))[:, 0]
         expected = torch.full((125,), -1.0)
         expected[k * (25 + 5 + 1)] = 7  # 2 * 2 * 2 - 1
@@ -110,26 +110,16 @@ def test_gradients_are_those_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(of, (positions, *volumes.parameters()), fast_mode=True)
 
 
-@pytest.mark.parametrize("batch", [(), (0,), (2, 3)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_any_batch_and_dtype(batch: tuple[int, ...], dtype: torch.dtype) -> None:
-    features = filled(dtype=dtype)(torch.ones(*batch, 3, dtype=dtype), torch.ones(batch, dtype=dtype))
-    assert features.shape == (*batch, 6)
-    assert features.dtype == dtype
-
-
 def test_the_head_sees_them() -> None:
-    """A fresh field hardly changes with time, one with contents does; beside what it holds at a place for all times."""
+    """A fresh field hardly changes with time; one whose tables hold something does."""
     field = GridField(BOX, (4,), 2, hidden_features=16, space_time=SpaceTimeVolumes(BOX, (4,), (4,)))
     positions, times = some_places(dtype=torch.float32)
-    assert field.has_changes
-    static = field.contents(positions).detach()
+    assert not field.is_static
     first, later = (field.density(positions, t).detach() for t in (torch.zeros(50), times))
     torch.testing.assert_close(first, later, rtol=0.1, atol=0)
     assert field.space_time is not None
     for table in field.space_time.tables:
         torch.nn.init.normal_(table)
-    assert torch.equal(field.contents(positions), static)
     first, later = (field.density(positions, t).detach() for t in (torch.zeros(50), times))
     assert ((later / first).log().abs() > 0.1).float().mean() > 0.5
     for parameter in (*field.space_time.tables, field.table):
@@ -137,25 +127,16 @@ def test_the_head_sees_them() -> None:
         assert gradient.abs().sum() > 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([[0, 0, 0], [1, 0, 1]],), "box must have finite corners"),
-        ((BOX, (4, 8), (2,)), r"time_resolutions must have as many levels as resolutions \[4, 8\], got \[2\]"),
-        ((BOX, (), ()), "resolutions"),
-        ((BOX, (4,), (0,)), "resolutions must be positive"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    (([[0, 0, 0], [1, 0, 1]],), "box must have finite corners"),
+    ((BOX, (4, 8), (2,)), r"time_resolutions must have as many levels as resolutions \[4, 8\], got \[2\]"),
+    ((BOX, (), ()), "resolutions"), ((BOX, (4,), (0,)), "resolutions must be positive"),
+])  # fmt: skip
 def test_bad_volumes_are_refused(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SpaceTimeVolumes(*arguments)
     with pytest.raises(ValueError, match="num_features must be > 0"):
         SpaceTimeVolumes(BOX, num_features=0)
-
-
-def test_times_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="times"):
-        filled()(torch.zeros(4, 3), torch.zeros(3))
 
 
 def test_roughness_is_of_differences_in_space_and_of_second_differences_in_time() -> None:

@@ -22,3 +22,17 @@ def compiled(request):
 def reference():
     with kernels.use_backend("reference"):
         yield
+
+
+@pytest.fixture(params=["numba", "reference"])
+def backend(request):
+    """Select each of the two versions that every kernel has on a CPU, and give its name."""
+    with kernels.use_backend(request.param):
+        yield request.param
+
+
+@pytest.fixture
+def served(monkeypatch):
+    """Kernels for vectors in bfloat16 serve networks also on CPUs that multiply tiles."""
+    for kernel in ("relu_layers", "grid_network"):
+        monkeypatch.setattr(f"dnerf.kernels.cpu.{kernel}.is_supported", lambda: True)

@@ -4,32 +4,27 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernels.backends import under
+from kernels.test_seen_parts import intervals
 from torch import Tensor
 
 from dnerf import kernels
-from dnerf.compositing import FieldOutput, composite
+from dnerf.core.compositing import FieldOutput, composite
+from dnerf.core.rays import Samples
 from dnerf.kernels import add_seen
 from dnerf.kernels.add_seen import add_seen_reference
-from dnerf.rays import Samples
-
-BACKENDS = pytest.mark.parametrize("backend", ["numba", "reference"])
 
 
 def rounds(counts: list[int], seed: int = 0, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
     """Arguments for rays with so many samples each, in rows of a larger table that are not in order."""
+    starts, _, offsets, density, light = intervals(counts, seed)
     g = torch.Generator().manual_seed(seed)
-    offsets = torch.tensor([0, *counts]).cumsum(0)
-    size = int(offsets[-1])
-    starts = torch.cat([torch.arange(n) * 0.03 + 2 for n in counts]) if size else torch.zeros(0)
     arguments = {
         "sums": torch.rand(len(counts) + 3, 5, generator=g),
         "rays": torch.randperm(len(counts) + 3, generator=g)[: len(counts)],
-        "light": torch.rand(len(counts), generator=g),
-        "starts": starts,
-        "ends": starts + 0.03 * torch.rand(size, generator=g),
-        "offsets": offsets,
-        "density": torch.exp(4 * torch.randn(size, generator=g)),
-        "rgb": torch.rand(size, 3, generator=g),
+        "ends": starts + 0.03 * torch.rand(len(starts), generator=g),
+        "rgb": torch.rand(len(starts), 3, generator=g),
+        **{"light": light, "starts": starts, "offsets": offsets, "density": density},
     }
     return {k: x.to(dtype) if x.is_floating_point() else x for k, x in arguments.items()}
 
@@ -37,8 +32,7 @@ def rounds(counts: list[int], seed: int = 0, dtype: torch.dtype = torch.float32)
 def added(backend: str, arguments: dict[str, Tensor], distances: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """What the sums become, and what passes."""
     sums = arguments["sums"].clone()
-    with kernels.use_backend(backend):
-        passing = add_seen(**(arguments | {"sums": sums}), distances=distances)
+    passing = under(backend, add_seen, **(arguments | {"sums": sums}), distances=distances)
     return sums, passing
 
 
@@ -54,18 +48,16 @@ def test_numba_equals_the_definition(counts: list[int], has_distances: bool, see
     torch.testing.assert_close(found, (sums.float(), passing.float()), rtol=0, atol=3e-6)
 
 
-@BACKENDS
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_rounds_add_up_to_one_picture(backend: str, dtype: torch.dtype) -> None:
+def test_rounds_add_up_to_one_image(backend: str, dtype: torch.dtype) -> None:
     count, first = 12, 5
     a = rounds([count] * 20, dtype=dtype)
     samples = Samples(a["starts"], a["ends"], 20, ray_indices=torch.arange(20).repeat_interleave(count))
     whole = composite(samples, FieldOutput(a["density"], a["rgb"]))
     sums, light = torch.zeros(20, 5, dtype=dtype), torch.ones(20, dtype=dtype)
     for part in (slice(first), slice(first, None)):
-        of_part = {
-            k: a[k].unflatten(0, (20, count))[:, part].flatten(0, 1) for k in ("starts", "ends", "density", "rgb")
-        }
+        names = ("starts", "ends", "density", "rgb")
+        of_part = {k: a[k].unflatten(0, (20, count))[:, part].flatten(0, 1) for k in names}
         offsets = torch.arange(21) * (len(of_part["starts"]) // 20)
         with kernels.use_backend(backend):
             light = light * add_seen(sums, torch.arange(20), light, offsets=offsets, **of_part)
@@ -74,13 +66,13 @@ def test_rounds_add_up_to_one_picture(backend: str, dtype: torch.dtype) -> None:
     torch.testing.assert_close(light, 1 - whole.opacity, rtol=0, atol=2e-6)
 
 
-@BACKENDS
 def test_hard_densities(backend: str) -> None:
     """Nothing passes what is opaque, nothing is added of what is empty, NaN is seen; other rays and rows stay."""
-    a = rounds([2, 2, 2, 2])
-    a["density"] = torch.tensor([torch.inf, 5, 0, 0, torch.nan, 1, 1e30, 1e30])
+    a = rounds([2, 2, 2, 2, 2])
+    a["density"] = torch.tensor([torch.inf, 5, 0, 0, torch.nan, 1, 1e30, 1e30, 1, torch.inf])
+    a["ends"][9] = a["starts"][9]
     sums, passing = added(backend, a)
-    first, second, third, fourth = (sums[row] - a["sums"][row] for row in a["rays"].tolist())
+    first, second, third, fourth, last = (sums[row] - a["sums"][row] for row in a["rays"].tolist())
     torch.testing.assert_close(first[:3], a["light"][0] * a["rgb"][0])
     assert passing[[0, 3]].tolist() == [0, 0]
     assert passing[1] == 1
@@ -88,21 +80,24 @@ def test_hard_densities(backend: str) -> None:
     assert not second.any()
     assert third.isnan().all()
     assert passing[2].isnan()
+    opacity = -torch.expm1(a["starts"][8] - a["ends"][8])  # of the first sample alone: the other one has no length
+    torch.testing.assert_close(last[4], a["light"][4] * opacity)
     others = torch.ones(len(sums), dtype=torch.bool).index_fill_(0, a["rays"], False)
     assert torch.equal(sums[others], a["sums"][others])
 
 
-def test_wrong_arguments_are_named() -> None:
+@pytest.mark.parametrize(
+    ("name", "wrong", "message"),
+    [
+        *((name, slice(1, None), f"{name} must have shape") for name in ("light", "density", "ends", "offsets")),
+        *((name, (slice(None), slice(2)), f"{name} must have shape") for name in ("sums", "rgb")),
+        ("offsets", torch.tensor([0, 2, 5]), "offsets must run from 0 to 4, got 0 to 5"),
+        ("rays", torch.tensor([1, 5]), r"rays must lie in \[0, 5\), got 1 to 5"),
+        ("distances", torch.zeros(3), "distances must have shape"),
+    ],
+)
+def test_wrong_arguments_are_named(name: str, wrong: object, message: str) -> None:
     a = rounds([2, 2])
-    wrong_shapes = {"sums": a["sums"][:, :4], "light": a["light"][1:], "rgb": a["rgb"][:, :2]}
-    wrong_shapes |= {name: a[name][1:] for name in ("density", "ends", "offsets")}
-    for name, wrong in wrong_shapes.items():
-        with pytest.raises(ValueError, match=f"{name} must have shape"):
-            add_seen(**(a | {name: wrong}))
-    with pytest.raises(ValueError, match="distances must have shape"):
-        add_seen(**a, distances=a["starts"][1:])
-    with kernels.use_backend("numba"):
-        with pytest.raises(ValueError, match="offsets must run from 0 to 4, got 0 to 5"):
-            add_seen(**(a | {"offsets": torch.tensor([0, 2, 5])}))
-        with pytest.raises(ValueError, match=r"rays must lie in \[0, 5\), got 1 to 5"):
-            add_seen(**(a | {"rays": torch.tensor([1, 5])}))
+    value = wrong if isinstance(wrong, Tensor) else a[name][wrong]
+    with kernels.use_backend("numba"), pytest.raises(ValueError, match=message):
+        add_seen(**a | {name: value})

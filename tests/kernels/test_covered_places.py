@@ -4,8 +4,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernels.backends import under
 
-from dnerf import kernels
 from dnerf.kernels import covered_places
 from dnerf.kernels.covered_places import covered_places_reference
 
@@ -19,7 +19,7 @@ def random_boxes(shape, count, reach, seed):
 
 @settings(max_examples=60, deadline=None)
 @given(
-    shape=st.lists(st.integers(0, 12), min_size=1, max_size=3),
+    shape=st.tuples(*[st.integers(0, 12)] * 3),
     count=st.integers(0, 20),
     reach=st.sampled_from([1, 3, 40]),
     seed=st.integers(0, 99),
@@ -31,24 +31,23 @@ def test_both_versions_equal_a_loop_over_boxes(shape, count, reach, seed):
         mask[tuple(itertools.starmap(slice, zip(low, end, strict=True)))] = True
     expected = mask.reshape(-1).nonzero()[:, 0]
     assert torch.equal(covered_places_reference(lows, ends, shape), expected)
-    with kernels.use_backend("numba"):
-        assert torch.equal(covered_places(lows, ends, shape), expected)
+    assert torch.equal(under("numba", covered_places, lows, ends, shape), expected)
 
 
+@pytest.mark.usefixtures("backend")
 def test_many_boxes_over_one_place_are_counted_right():
-    lows, ends = torch.zeros(2, 70_000, dtype=torch.int64), torch.ones(2, 70_000, dtype=torch.int64)
-    for backend in ("numba", "reference"):
-        with kernels.use_backend(backend):
-            assert covered_places(lows, ends, (2, 3)).tolist() == [0]
+    lows, ends = torch.zeros(3, 70_000, dtype=torch.int64), torch.ones(3, 70_000, dtype=torch.int64)
+    assert covered_places(lows, ends, (1, 2, 3)).tolist() == [0]
 
 
-def test_what_does_not_fit_is_refused():
-    boxes = torch.zeros(2, 4, dtype=torch.int64)
-    with pytest.raises(ValueError, match="shape must be of 1 to 3 sizes"):
-        covered_places(boxes, boxes, (2, 2, 2, 2))
-    with pytest.raises(ValueError, match=r"lows must be \(3, M\)"):
-        covered_places(boxes, boxes, (2, 2, 2))
-    with pytest.raises(ValueError, match="ends must be"):
-        covered_places(boxes, boxes.float(), (2, 2))
-    with pytest.raises(ValueError, match="as many boxes, got 4 and 3"):
-        covered_places(boxes, boxes[:, 1:], (2, 2))
+@pytest.mark.parametrize(
+    ("shape", "dtype", "raster", "message"),
+    [
+        ((3, 4), torch.int64, (2, 2), "shape must be of three sizes"),
+        ((2, 4), torch.int64, (2, 2, 2), r"ends must have shape \(3, 4\), got \(2, 4\)"),
+        ((3, 4), torch.float32, (2, 2, 2), "must be int64, got torch.int64 and torch.float32"),
+    ],
+)
+def test_what_does_not_fit_is_refused(shape, dtype, raster, message):
+    with pytest.raises(ValueError, match=message):
+        covered_places(torch.zeros(3, 4, dtype=torch.int64), torch.zeros(shape, dtype=dtype), raster)

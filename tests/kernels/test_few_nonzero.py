@@ -4,8 +4,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from kernels.backends import under
 
-from dnerf import kernels
 from dnerf.kernels import few_nonzero
 
 
@@ -13,8 +13,7 @@ from dnerf.kernels import few_nonzero
 def test_it_equals_nonzero(shape: list[int], share: float, seed: int) -> None:
     mask = torch.rand(shape, generator=torch.Generator().manual_seed(seed)) < share
     for backend in ("numba", "reference"):
-        with kernels.use_backend(backend):
-            assert torch.equal(few_nonzero(mask), mask.reshape(-1).nonzero()[:, 0])
+        assert torch.equal(under(backend, few_nonzero, mask), mask.reshape(-1).nonzero()[:, 0])
 
 
 def test_views_may_begin_anywhere_and_skip() -> None:

@@ -4,20 +4,15 @@ import itertools
 
 import pytest
 import torch
+from kernels.backends import under
 from torch import Tensor
 
-from dnerf.kernels import GridLevels, grid_encode, grid_network, use_backend
+from dnerf.kernels import GridLevels, grid_encode, grid_network
 from dnerf.kernels.cpu.dense import has_vectors
 from dnerf.kernels.grid_network import grid_network_reference
 
 vectors = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
 LEVELS = GridLevels([3, (5, 6, 7), 20], 512)  # the last one is hashed
-
-
-@pytest.fixture
-def fused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also on CPUs that multiply tiles."""
-    monkeypatch.setattr("dnerf.kernels.cpu.grid_network.is_supported", lambda: True)
 
 
 def network(widths: tuple[int, ...], seed: int = 0) -> tuple[list[Tensor], list[Tensor]]:
@@ -45,7 +40,7 @@ def exact(positions: Tensor, rows: Tensor, weights: list[Tensor], biases: list[T
 
 
 @vectors
-@pytest.mark.usefixtures("fused")
+@pytest.mark.usefixtures("served")
 @pytest.mark.parametrize("count", [0, 1, 11, 256, 257, 700])
 @pytest.mark.parametrize(("num_features", "widths"), [(8, (64, 64, 4)), (2, (16, 1)), (4, (128, 16, 16))])
 def test_it_is_one_part_after_the_other(count: int, num_features: int, widths: tuple[int, ...]) -> None:
@@ -68,30 +63,27 @@ def test_it_is_one_part_after_the_other(count: int, num_features: int, widths: t
 def test_without_autocast_nothing_is_rounded(backend: str) -> None:
     rows, (weights, biases) = table(2), network((6, 16, 3))
     positions = places(50)
-    with use_backend(backend):
-        found = grid_network(positions, rows, LEVELS, weights, biases)
+    found = under(backend, grid_network, positions, rows, LEVELS, weights, biases)
     hidden = torch.relu(grid_encode(positions, rows, LEVELS) @ weights[0].T + biases[0])
     torch.testing.assert_close(found, hidden @ weights[1].T + biases[1])
 
 
 @vectors
-@pytest.mark.usefixtures("fused")
+@pytest.mark.usefixtures("served")
 def test_other_sizes_and_dtypes_take_the_chain() -> None:
     positions = places(30)
     for num_features, widths in ((1, (16, 4)), (2, (12, 4)), (2, (16, 17))):
         rows, parameters = table(num_features), network((3 * num_features, *widths))
         with torch.autocast("cpu", torch.bfloat16):
-            assert torch.equal(
-                grid_network(positions, rows, LEVELS, *parameters),
-                grid_network_reference(positions, rows, LEVELS, *parameters),
-            )
+            found, chain = (f(positions, rows, LEVELS, *parameters) for f in (grid_network, grid_network_reference))
+        assert torch.equal(found, chain)
     rows, (weights, biases) = table(2).double(), network((6, 16, 4))
     double = [[p.double() for p in parameters] for parameters in (weights, biases)]
     assert grid_network(positions.double(), rows, LEVELS, *double).dtype == torch.float64
 
 
 @vectors
-@pytest.mark.usefixtures("fused")
+@pytest.mark.usefixtures("served")
 def test_nan_stays_in_its_row() -> None:
     rows, parameters = table(8), network((24, 64, 64, 4))
     positions = places(300)
@@ -102,19 +94,12 @@ def test_nan_stays_in_its_row() -> None:
     assert bool(found[[i for i in range(300) if i != 17]].isfinite().all())
 
 
-@vectors
-def test_op_is_registered_properly() -> None:
-    weights, biases = network((24, 64, 64, 4))
-    arguments = (places(40), table(8), LEVELS.cells, LEVELS.max_rows)
-    rounded = [[p.bfloat16() for p in parameters] for parameters in (weights, biases)]
-    torch.library.opcheck(torch.ops.dnerf.grid_network.default, (*arguments, *rounded))
-
-
 def test_shapes_that_do_not_fit_are_refused() -> None:
-    weights, biases = network((6, 16, 4))
-    with pytest.raises(ValueError, match="at least two layers"):
-        grid_network(places(3), table(2), LEVELS, weights[:1], biases[:1])
-    with pytest.raises(ValueError, match="must have 9 columns"):
-        grid_network(places(3), table(3), LEVELS, weights, biases)
-    with pytest.raises(ValueError, match="positions must have shape"):
-        grid_network(places(3)[:, :2], table(2), LEVELS, weights, biases)
+    for axes, num_features, num_layers, message in (
+        (3, 2, 1, "at least two layers"),
+        (3, 3, 2, r"first weights must have shape \(n, 9\)"),
+        (2, 2, 2, "positions must have shape"),
+    ):
+        parameters = (x[:num_layers] for x in network((6, 16, 4)))
+        with pytest.raises(ValueError, match=message):
+            grid_network(places(3)[:, :axes], table(num_features), LEVELS, *parameters)

@@ -4,9 +4,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernels.backends import under
 from torch import Tensor
 
-from dnerf import kernels
 from dnerf.kernels import lattice_places
 from dnerf.kernels.lattice_places import lattice_places_reference
 
@@ -30,11 +30,6 @@ def rays(num_rays: int, count: int, seed: int = 0, dtype: torch.dtype = torch.fl
     return (inside - 2 * directions).to(dtype), directions.to(dtype), indices, distances.to(dtype)
 
 
-def with_backend(name: str, *arguments: object) -> Tensor:
-    with kernels.use_backend(name):
-        return lattice_places(*arguments)  # type: ignore[arg-type]
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     num_rays=st.integers(1, 9),
@@ -47,17 +42,16 @@ def test_numba_equals_the_definition(num_rays: int, count: int, columns: int, nu
     table = 0.1 * torch.randn(60, columns, generator=torch.Generator().manual_seed(seed))
     table[:num_unknown] = torch.nan
     arguments = (*rays(num_rays, count, seed), table, SHAPE, LOW, SIDES)
-    torch.testing.assert_close(
-        with_backend("numba", *arguments), lattice_places_reference(*arguments), rtol=0, atol=2e-6, equal_nan=True
-    )
+    found, expected = under("numba", lattice_places, *arguments), lattice_places_reference(*arguments)
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6, equal_nan=True)
 
 
-@pytest.mark.parametrize("backend", ["numba", "reference"])
-def test_displacements_that_are_linear_in_space_are_exact(backend: str) -> None:
+@pytest.mark.usefixtures("backend")
+def test_displacements_that_are_linear_in_space_are_exact() -> None:
     matrix = torch.tensor([[0.1, 0.3, 0.0], [0.0, -0.2, 0.1], [0.4, 0.0, 0.2]])
     table = torch.nn.functional.pad(vertices() @ matrix.T, (0, 1))
     origins, directions, indices, distances = rays(20, 500)
-    places = with_backend(backend, origins, directions, indices, distances, table, SHAPE, LOW, SIDES)
+    places = lattice_places(origins, directions, indices, distances, table, SHAPE, LOW, SIDES)
     points = origins[indices] + distances[:, None] * directions[indices]
     unit = (points - LOW) / SIDES
     is_in = ((unit >= 0) & (unit <= 1)).all(-1)
@@ -69,14 +63,10 @@ def test_displacements_that_are_linear_in_space_are_exact(backend: str) -> None:
 def test_cells_with_an_unknown_vertex_are_unknown_and_no_others() -> None:
     table = torch.zeros(60, 4)
     table[0] = torch.nan  # the lowest corner
-    origin, direction = LOW[None] - 1, torch.tensor([[1.0, 0.0, 0.0]])
-    offsets = torch.tensor([[0.0, 0.05, 0.05], [0.0, 0.9, 0.05]])  # in the first cell along y, in the second
-    distances = torch.tensor([1.1, 1.4, 1.6])  # cells along x are half a unit
-    indices = torch.tensor([0, 0, 0, 1])
-    places = lattice_places(
-        origin + 1 * torch.tensor([[0.0, 1.0, 1.0]]) + offsets, direction.expand(2, 3), indices,
-        torch.cat([distances, distances[:1]]), table, SHAPE, LOW, SIDES,
-    )  # fmt: skip
+    direction = torch.tensor([[1.0, 0.0, 0.0]])
+    origins = LOW + torch.tensor([[-1.0, 0.05, 0.05], [-1.0, 0.9, 0.05]])  # in the first cell along y, in the second
+    distances, indices = torch.tensor([1.1, 1.4, 1.6, 1.1]), torch.tensor([0, 0, 0, 1])  # cells along x: half a unit
+    places = lattice_places(origins, direction.expand(2, 3), indices, distances, table, SHAPE, LOW, SIDES)
     assert places[:, 0].isnan().tolist() == [True, True, False, False]
 
 
@@ -90,11 +80,11 @@ def test_places_that_are_no_numbers_stay_so() -> None:
 def test_wrong_arguments_are_named() -> None:
     origins, directions, indices, distances = rays(2, 4)
     table = torch.zeros(60, 4)
-    with pytest.raises(ValueError, match=r"displacements must have shape .* of \(4, 3, 5\) vertices"):
-        lattice_places(origins, directions, indices, distances, table[1:], SHAPE, LOW, SIDES)
-    with pytest.raises(ValueError, match="at least two each"):
-        lattice_places(origins, directions, indices, distances, table[:20], (4, 1, 5), LOW, SIDES)
-    with pytest.raises(ValueError, match="ray_indices must have shape"):
-        lattice_places(origins, directions, indices[1:], distances, table, SHAPE, LOW, SIDES)
-    with pytest.raises(ValueError, match=r"ray_indices must lie in \[0, 2\)"):
-        lattice_places(origins, directions, indices + 5, distances, table, SHAPE, LOW, SIDES)
+    for shape, rows, rays_of, message in (
+        (SHAPE, table[1:], indices, r"displacements must have shape .* of \(4, 3, 5\) vertices"),
+        ((4, 1, 5), table[:20], indices, "at least two each"),
+        (SHAPE, table, indices[1:], "ray_indices must have shape"),
+        (SHAPE, table, indices + 5, r"ray_indices must lie in \[0, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            lattice_places(origins, directions, rays_of, distances, rows, shape, LOW, SIDES)

@@ -43,16 +43,11 @@ def imported_afresh(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_kernel_is_compiled_once_and_again_when_a_file_it_is_made_of_changes(package, monkeypatch):
-    get = imported_afresh(monkeypatch)
-    assert get() == 1
-    assert sum(get.stats.cache_misses.values()) == 1
-    get = imported_afresh(monkeypatch)
-    assert get() == 1
-    assert sum(get.stats.cache_hits.values()) == 1
-    (package / "helper.py").write_text(HELPER.format("1 + 1"))
-    get = imported_afresh(monkeypatch)
-    assert get() == 2
-    assert sum(get.stats.cache_misses.values()) == 1
+    for number, counter in ((1, "cache_misses"), (1, "cache_hits"), (2, "cache_misses")):
+        (package / "helper.py").write_text(HELPER.format(number))
+        get = imported_afresh(monkeypatch)
+        assert get() == number
+        assert sum(getattr(get.stats, counter).values()) == 1
 
 
 def test_kernels_are_kept_beside_their_files_or_where_numba_is_told_to(package, monkeypatch, tmp_path):

@@ -5,10 +5,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernels.backends import under
 
-from dnerf import kernels
-from dnerf.kernels import MarchGrid, march, skip_distances
+from dnerf.kernels import MarchGrid, march, march_to_size, skip_distances
+from dnerf.kernels.march_to_size import fitted
 
+STEP = torch.tensor(0.07)
 BOX = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 0.5, 3.0]])
 
 
@@ -88,6 +90,22 @@ def assert_same(actual, expected):
         assert torch.equal(a.cpu(), b.cpu())
 
 
+def march_on(device, bundle, occupancy, step, **options):
+    """Through the box, on a device."""
+    bundle = {name: value.to(device) for name, value in bundle.items()}
+    return march(**bundle, occupancy=occupancy.to(device), aabb=BOX.to(device), step=step, **options)
+
+
+def parallel(origin, direction, times, jitter=0.0):
+    """Rays from one point in one direction, of several times."""
+    count, times = len(times), torch.tensor(times)
+    pose = {
+        "origins": torch.tensor([origin]).expand(count, 3),
+        "directions": torch.tensor([direction]).expand(count, 3),
+    }
+    return pose | {"near": 0 * times, "far": 0 * times + 10, "times": times, "jitter": 0 * times + jitter}
+
+
 @pytest.mark.parametrize("limit", [None, 3])
 def test_reference_equals_loop(reference, limit):
     arguments = rays(120)
@@ -110,20 +128,16 @@ def test_skipping_changes_no_bit(num_rays, shape, share, step, limit, seed, part
     occupancy, inside = grid(shape, share, seed), torch.zeros(shape, dtype=torch.bool)
     inside[(slice(None), *(slice(first, first + size) for first, size in part))] = True
     arguments = rays(num_rays, seed) | {"occupancy": occupancy & inside, "aabb": BOX, "step": step}
-    with kernels.use_backend("reference"):
-        expected = march(**arguments, max_samples_per_ray=limit)
-    with kernels.use_backend("numba"):
-        assert_same(march(**arguments, max_samples_per_ray=limit), expected)
+    expected = under("reference", march, **arguments, max_samples_per_ray=limit)
+    assert_same(under("numba", march, **arguments, max_samples_per_ray=limit), expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("limit", [None, 2])
 def test_compiled_equals_reference(compiled, dtype, limit):
-    arguments = {k: v.to(compiled) for k, v in rays(40, dtype=dtype).items()}
-    arguments |= {"occupancy": grid().to(compiled), "aabb": BOX.to(compiled), "step": 0.07}
-    actual = march(**arguments, max_samples_per_ray=limit)
-    with kernels.use_backend("reference"):
-        assert_same(actual, march(**arguments, max_samples_per_ray=limit))
+    arguments = compiled, rays(40, dtype=dtype), grid(), 0.07
+    actual = march_on(*arguments, max_samples_per_ray=limit)
+    assert_same(actual, under("reference", march_on, *arguments, max_samples_per_ray=limit))
 
 
 def test_precomputed_skips_change_nothing():
@@ -141,76 +155,41 @@ def test_distant_and_nearly_parallel_rays_skip_exactly():
     occupancy[1, 20:] = False
     occupancy[2, :, :30, 8:] = False
     arguments |= {"occupancy": occupancy, "aabb": BOX, "step": 0.01}
-    with kernels.use_backend("reference"):
-        expected = march(**arguments)
+    expected = under("reference", march, **arguments)
     assert len(expected.starts) > 100
-    with kernels.use_backend("numba"):
-        assert_same(march(**arguments), expected)
+    assert_same(under("numba", march, **arguments), expected)
 
 
 def test_full_grid_is_covered_from_entry_to_exit(compiled):
-    origins = torch.tensor([[-3.0, 0.0, 1.0]], device=compiled)
-    ones = torch.ones(1, device=compiled)
-    result = march(
-        origins,
-        torch.tensor([[1.0, 0.0, 0.0]], device=compiled),
-        0 * ones,
-        10 * ones,
-        times=ones,
-        jitter=0.25 * ones,
-        occupancy=torch.ones(2, 4, 4, 4, dtype=torch.bool, device=compiled),
-        aabb=BOX.to(compiled),
-        step=0.3,
-    )
-    assert result.starts[0] == 2
-    assert result.ends[-1] == 4
+    bundle = parallel([-3.0, 0.0, 1.0], [1.0, 0.0, 0.0], [1.0], jitter=0.25)
+    result = march_on(compiled, bundle, torch.ones(2, 4, 4, 4, dtype=torch.bool), 0.3)
+    assert (result.starts[0], result.ends[-1]) == (2, 4)
     assert torch.equal(result.starts[1:], result.ends[:-1])
-    torch.testing.assert_close(result.ends[1:-1] - result.starts[1:-1], torch.full((6,), 0.3, device=compiled))
-    torch.testing.assert_close(result.ends[0] % 0.3, 0.075 * ones[0])
+    torch.testing.assert_close((result.ends[1:-1] - result.starts[1:-1]).cpu(), torch.full((6,), 0.3))
+    torch.testing.assert_close((result.ends[0] % 0.3).cpu(), torch.tensor(0.075))
 
 
 def test_only_the_slab_of_the_time_is_read(compiled):
-    occupancy = torch.zeros(4, 2, 2, 2, dtype=torch.bool, device=compiled)
+    occupancy = torch.zeros(4, 2, 2, 2, dtype=torch.bool)
     occupancy[3] = True
-    times = torch.tensor([0.0, 0.7499, 0.75, 1.0], device=compiled)
-    result = march(
-        torch.tensor([[-3.0, 0.1, 1.0]], device=compiled).expand(4, 3),
-        torch.tensor([[1.0, 0.0, 0.0]], device=compiled).expand(4, 3),
-        torch.zeros(4, device=compiled),
-        torch.full((4,), 10.0, device=compiled),
-        times=times,
-        jitter=torch.zeros(4, device=compiled),
-        occupancy=occupancy,
-        aabb=BOX.to(compiled),
-        step=0.5,
-    )
-    assert result.offsets.tolist() == [0, 0, 0, 4, 8]
+    bundle = parallel([-3.0, 0.1, 1.0], [1.0, 0.0, 0.0], [0.0, 0.7499, 0.75, 1.0])
+    assert march_on(compiled, bundle, occupancy, 0.5).offsets.tolist() == [0, 0, 0, 4, 8]
 
 
 @pytest.mark.parametrize("num_rays", [0, 6])
 def test_no_samples_give_empty_tensors(compiled, num_rays):
-    arguments = {k: v.to(compiled) for k, v in rays(num_rays).items()}
-    occupancy = torch.zeros(1, 4, 4, 4, dtype=torch.bool, device=compiled)
-    result = march(**arguments, occupancy=occupancy, aabb=BOX.to(compiled), step=0.1)
+    result = march_on(compiled, rays(num_rays), torch.zeros(1, 4, 4, 4, dtype=torch.bool), 0.1)
     assert [len(x) for x in result] == [0, 0, 0, num_rays + 1]
     assert result.ray_indices.dtype == result.offsets.dtype == torch.int64
 
 
 def test_rays_that_are_not_finite_get_no_samples(compiled):
-    arguments = {k: v.to(compiled) for k, v in rays(4).items()}
-    arguments["origins"][0, 1] = torch.nan
-    arguments["directions"][1, 2] = torch.nan
-    arguments["near"][2] = torch.nan
-    arguments["far"][3] = torch.nan
-    occupancy = torch.ones(1, 4, 4, 4, dtype=torch.bool, device=compiled)
-    result = march(**arguments, occupancy=occupancy, aabb=BOX.to(compiled), step=0.1)
-    assert len(result.starts) == 0
+    full, broken = torch.ones(1, 4, 4, 4, dtype=torch.bool), rays(4)
+    broken["origins"][0, 1] = broken["directions"][1, 2] = broken["near"][2] = broken["far"][3] = torch.nan
+    assert not len(march_on(compiled, broken, full, 0.1).starts)
     # Also where the ray does not move along the axis on which it is not finite.
-    arguments = {k: v.to(compiled) for k, v in rays(4).items()}
-    arguments["origins"] = torch.tensor([[torch.nan, 0.0, -3.0]], device=compiled).expand(4, 3).contiguous()
-    arguments["directions"] = torch.tensor([[0.0, 0.0, 1.0]], device=compiled).expand(4, 3).contiguous()
-    result = march(**arguments, occupancy=occupancy, aabb=BOX.to(compiled), step=0.1)
-    assert len(result.starts) == 0
+    still = parallel([torch.nan, 0.0, -3.0], [0.0, 0.0, 1.0], [0.5])
+    assert not len(march_on(compiled, still, full, 0.1).starts)
 
 
 @pytest.mark.parametrize(
@@ -218,10 +197,10 @@ def test_rays_that_are_not_finite_get_no_samples(compiled):
     [
         ({"near": torch.zeros(4, 1)}, r"near must have shape \(4,\), got \(4, 1\)"),
         ({"directions": torch.zeros(3, 3)}, r"directions must have shape \(4, 3\)"),
-        ({"occupancy": torch.zeros(4, 4, 4, dtype=torch.bool)}, "occupancy must be bool"),
+        ({"occupancy": torch.zeros(4, 4, 4, dtype=torch.bool)}, "occupancy must be bool of shape"),
         ({"aabb": torch.zeros(6)}, r"aabb must have shape \(2, 3\)"),
-        ({"step": 0.0}, "step must be positive"),
-        ({"max_samples_per_ray": 0}, "max_samples_per_ray must be at least 1"),
+        ({"step": 0.0}, "step must be > 0"),
+        ({"max_samples_per_ray": 0}, "max_samples_per_ray must be > 0"),
         ({"skips": torch.zeros(1, 1, 1, 1, dtype=torch.uint8)}, "skips must have shape"),
     ],
 )
@@ -250,30 +229,53 @@ def test_extent_of_nothing_is_small():
     torch.testing.assert_close(found[1] - found[0], torch.full((3,), 0.05))
 
 
-def test_opcheck():
-    arguments = rays(6)
-    order = ("origins", "directions", "near", "far", "times", "jitter")
-    torch.library.opcheck(torch.ops.dnerf.march.default, (*(arguments[k] for k in order), grid(), BOX, 0.1, None, None))
-
-
-def test_compiles_without_graph_breaks():
-    arguments = rays(30) | {"occupancy": grid(), "aabb": BOX}
-    with torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True):
-        lengths = torch.compile(
-            lambda **k: (lambda s: s.ends - s.starts)(march(**k, step=0.1)),
-            fullgraph=True,
-            backend="aot_eager",
-        )
-        actual = lengths(**arguments)
-    samples = march(**arguments, step=0.1)
-    assert torch.equal(actual, samples.ends - samples.starts)
-
-
 def test_rays_may_require_gradients(compiled):
-    arguments = {k: v.to(compiled) for k, v in rays(20).items()}
-    constants = {"occupancy": grid().to(compiled), "aabb": BOX.to(compiled), "step": 0.1}
-    expected = march(**arguments, **constants)
-    arguments["origins"].requires_grad_()
-    result = march(**arguments, **constants)
+    bundle = rays(20)
+    expected = march_on(compiled, bundle, grid(), 0.1)
+    bundle["origins"].requires_grad_()
+    result = march_on(compiled, bundle, grid(), 0.1)
     assert_same(result, expected)
     assert not result.starts.requires_grad
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1, 20, 60, 500])
+def test_compiled_march_to_size_equals_its_definition(compiled, size, dtype):
+    """All fit, some rays do not, none does."""
+    arguments = rays(120, dtype=dtype) | {"occupancy": grid(), "aabb": BOX.to(dtype)}
+    marched = under("reference", march, **arguments, step=float(STEP.to(dtype)))
+    expected, wanted = fitted(marched, size)
+    moved = {name: value.to(compiled) for name, value in arguments.items()}
+    actual, found = march_to_size(**moved, step=STEP.to(compiled, dtype), size=size)
+    assert_same(actual, expected)
+    assert int(found) == int(wanted) == len(marched.starts) > 60
+    is_real = expected.ends > expected.starts
+    assert is_real.sum() == len(marched.starts) if size == 500 else is_real.sum() <= size
+
+
+@given(seed=st.integers(0, 99), share=st.sampled_from([0.0, 0.01, 0.3]), size=st.integers(1, 300))
+def test_what_fits_is_what_is_marched(seed, share, size):
+    arguments = rays(50, seed) | {"occupancy": grid(share=share, seed=seed), "aabb": BOX}
+    marched = march(**arguments, step=0.07)
+    actual, wanted = march_to_size(**arguments, step=STEP, size=size)
+    assert int(wanted) == len(marched.starts)
+    last = int((marched.offsets <= size).sum()) - 1  # rays that fit
+    is_real = actual.ends > actual.starts
+    for name in ("starts", "ends", "ray_indices"):
+        assert torch.equal(getattr(actual, name)[is_real], getattr(marched, name)[: marched.offsets[last]])
+    assert int(actual.offsets[-1]) == size == len(actual.starts)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"size": 0}, "rays and places for samples, got 30 and 0"),
+        (rays(0), "got 0 and 10"),
+        ({"step": torch.ones(1)}, "step must be a scalar"),
+        ({"near": torch.zeros(3)}, "near must have shape"),
+    ],
+)
+def test_wrong_arguments_of_march_to_size_are_refused(changes, message):
+    arguments = rays(30) | {"occupancy": grid(), "aabb": BOX, "step": STEP, "size": 10} | changes
+    with pytest.raises(ValueError, match=message):
+        march_to_size(**arguments)

@@ -1,4 +1,4 @@
-"""Operations are known to autograd and to torch.compile, and load neither before somebody wants it."""
+"""Operations are known to autograd by name, and load no compiler."""
 
 import subprocess
 import sys
@@ -6,52 +6,46 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch.library import opcheck
 
-from dnerf.kernels.op import op
+from dnerf.kernels import GridLevels
 
-
-@op("kernels_for_a_test::double")
-def double(x: Tensor, factors: list[float]) -> Tensor:
-    return 2 * x * factors[0]
+LEVELS = GridLevels((2, 5), 64)
 
 
-@double.register_fake
-def _(x: Tensor, factors: list[float]) -> Tensor:
-    return torch.empty_like(x)
+def arguments_of_operations() -> dict[str, tuple[Any, ...]]:
+    """Five samples on three rays, and places on a grid."""
+    depth, values, offsets = torch.rand(5).double(), torch.rand(5, 3).double(), torch.tensor([0, 2, 2, 5])
+    grid = torch.rand(5, 3).double(), torch.rand(LEVELS.num_rows, 2).double(), LEVELS.cells, LEVELS.max_rows
+    ray = torch.tensor([[-2.0, 0.1, 0.2]]), torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1), torch.full((1,), 5.0)
+    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    return {
+        "march": (torch.ones(1, 4, 4, 4) > 0, [*ray, torch.zeros(1), torch.zeros(1)], box, 0.5, None, None),
+        "packed_weights": (depth, offsets),
+        "packed_weights_grad": (depth, depth, depth, offsets),
+        "packed_sum": (values, depth, offsets),
+        "packed_sum_grad_values": (values[:3], depth, offsets, 5),
+        "packed_sum_grad_weights": (values[:3], values, offsets),
+        "grid_encode": (*grid, False),
+        "grid_encode_grad_table": (torch.rand(5, 4).double(), *grid),
+        "grid_encode_grad_positions": (torch.rand(5, 4).double(), *grid),
+    }
 
 
-@op("kernels_for_a_test::halved")
-def halved(x: Tensor) -> Tensor:
-    return x / 2
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.factors = inputs[1]
-
-
-double.register_autograd(lambda ctx, gradient: (2 * ctx.factors[0] * gradient, None), setup_context=_save)
-
-
-def test_it_is_registered_under_its_name_and_has_gradients() -> None:
-    x = torch.tensor([1.0, -2.0], requires_grad=True)
-    y = double(x, [3.0])
-    assert torch.equal(torch.ops.kernels_for_a_test.double(x, [3.0]), y)
-    y.sum().backward()
-    assert x.grad is not None
-    assert x.grad.tolist() == [6.0, 6.0]
-    torch.library.opcheck(torch.ops.kernels_for_a_test.double, (x, [3.0]))
+@pytest.mark.parametrize("name", arguments_of_operations())
+def test_operations_change_no_argument_and_return_new_tensors(name: str) -> None:
+    opcheck(getattr(torch.ops.dnerf, name), arguments_of_operations()[name], test_utils=["test_schema"])
 
 
 def test_without_a_formula_gradients_are_refused() -> None:
-    y = halved(torch.ones(2, requires_grad=True))
-    assert y.tolist() == [0.5, 0.5]
-    with pytest.raises(RuntimeError, match="kernels_for_a_test::halved has no autograd formula"):
-        y.sum().backward()
+    cells, rays, *others = arguments_of_operations()["march"]
+    starts, *_ = torch.ops.dnerf.march(cells, [x.requires_grad_() for x in rays], *others)
+    with pytest.raises(RuntimeError, match="dnerf::march is not differentiable"):
+        starts.sum().backward()
 
 
 def test_kernels_and_their_gradients_load_no_compiler() -> None:
-    """It takes a second to load, which showing a picture can do without."""
+    """It takes a second to load, which an image can do without."""
     program = """
 import sys, torch
 from dnerf.kernels import packed_sum

@@ -3,39 +3,32 @@
 import pytest
 import torch
 
-from dnerf import kernels
 from dnerf.fields.activations import activate_density
 from dnerf.kernels import shade
 
 
-def shaded(backend: str, raw: torch.Tensor, bias: torch.Tensor, log_shift: float) -> tuple[torch.Tensor, torch.Tensor]:
-    with kernels.use_backend(backend):
-        return shade(raw, bias, log_shift)
-
-
-@pytest.mark.parametrize("backend", ["numba", "reference"])
+@pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float32, torch.float64])
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 600])
-def test_it_is_what_the_activations_make_of_the_sums(backend: str, dtype: torch.dtype, count: int) -> None:
+def test_it_is_what_the_activations_make_of_the_sums(dtype: torch.dtype, count: int) -> None:
     raw, bias = (5 * torch.randn(count, 4)).to(dtype), torch.randn(4)
     raw[::50, 0] = 40  # truncated
-    density, rgb = shaded(backend, raw, bias, -1.5)
+    density, rgb = shade(raw, bias, -1.5)
     values = raw.double() + bias.double()
     assert density.dtype == rgb.dtype == torch.promote_types(dtype, torch.float32)
     torch.testing.assert_close(density.double(), activate_density(values[:, 0], "exp", -1.5), rtol=5e-6, atol=0)
     torch.testing.assert_close(rgb.double(), torch.sigmoid(values[:, 1:]), rtol=2e-6, atol=1e-30)
 
 
-@pytest.mark.parametrize("backend", ["numba", "reference"])
-def test_extreme_numbers(backend: str) -> None:
+@pytest.mark.usefixtures("backend")
+def test_extreme_numbers() -> None:
     raw = torch.tensor([[torch.inf] * 4, [-torch.inf] * 4, [torch.nan] * 4, [0.0] * 4])
-    density, rgb = shaded(backend, raw, torch.zeros(4), 0.0)
+    density, rgb = shade(raw, torch.zeros(4), 0.0)
     torch.testing.assert_close(density, torch.tensor([15.0, -torch.inf, torch.nan, 0]).exp(), equal_nan=True)
     torch.testing.assert_close(rgb, torch.tensor([1.0, 0, torch.nan, 0.5])[:, None].expand(4, 3), equal_nan=True)
 
 
 def test_wrong_shapes_are_named() -> None:
-    with pytest.raises(ValueError, match=r"got \(2, 3\), \(4,\)"):
-        shade(torch.zeros(2, 3), torch.zeros(4), 0.0)
-    with pytest.raises(ValueError, match=r"got \(2, 4\), \(3,\)"):
-        shade(torch.zeros(2, 4), torch.zeros(3), 0.0)
+    for columns, size, message in ((3, 4, r"raw .* \(N, 4\), got \(2, 3\)"), (4, 3, "bias must have shape")):
+        with pytest.raises(ValueError, match=message):
+            shade(torch.zeros(2, columns), torch.zeros(size), 0.0)

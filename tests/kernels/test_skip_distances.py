@@ -2,29 +2,25 @@ import itertools
 
 import pytest
 import torch
+from kernels.backends import under
+from kernels.test_march import grid
 
-from dnerf import kernels
 from dnerf.kernels import skip_distances
 from dnerf.kernels.skip_distances import skip_distances_reference
-
-
-def random_grid(shape, share, seed=0):
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed)) < share
 
 
 @pytest.mark.parametrize("shape", [(2, 8, 8, 8), (1, 33, 17, 40), (3, 5, 64, 9)])
 @pytest.mark.parametrize("share", [0.0, 2e-4, 0.01, 1.0])
 def test_numba_equals_reference(shape, share):
-    grid = random_grid(shape, share)
-    with kernels.use_backend("numba"):
-        assert torch.equal(skip_distances(grid), skip_distances_reference(grid))
+    cells = grid(shape, share)
+    assert torch.equal(under("numba", skip_distances, cells), skip_distances_reference(cells))
 
 
 def test_reference_equals_loop():
-    grid = random_grid((2, 20, 30, 40), 3e-4)
-    distances = skip_distances_reference(grid)
+    cells = grid((2, 20, 30, 40), 3e-4)
+    distances = skip_distances_reference(cells)
     for slab in range(2):
-        occupied = (grid[slab].nonzero() // 8).tolist()
+        occupied = (cells[slab].nonzero() // 8).tolist()
         for block in itertools.product(*map(range, distances.shape[1:])):
             expected = min((max(abs(a - b) for a, b in zip(block, o)) for o in occupied), default=255)
             assert distances[slab][block] == expected

@@ -2,8 +2,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernels.backends import under
 
-from dnerf import kernels
 from dnerf.kernels import thin_out
 from dnerf.kernels.thin_out import thin_out_reference
 
@@ -20,11 +20,6 @@ def samples_of_rays(counts, gap, seed=0, dtype=torch.float32):
     return torch.cat(points), torch.cat(times)
 
 
-def with_numba(*arguments):
-    with kernels.use_backend("numba"):
-        return thin_out(*arguments)
-
-
 @settings(max_examples=50, deadline=None)
 @given(
     counts=st.lists(st.integers(0, 30), max_size=8),
@@ -37,26 +32,23 @@ def test_numba_equals_reference_on_random_rays(counts, gap, doubled, seed):
     if len(points):  # as samples are padded
         points = torch.cat([points, points[-1:].expand(doubled, 3)])
         times = torch.cat([times, times[-1:].expand(doubled)])
-    for found, expected in zip(with_numba(points, times, 0.1), thin_out_reference(points, times, 0.1), strict=True):
-        assert torch.equal(found, expected)
+    for both in zip(under("numba", thin_out, points, times, 0.1), thin_out_reference(points, times, 0.1), strict=True):
+        assert torch.equal(*both)
 
 
 @pytest.mark.parametrize("gap", [0.01, 0.04, 0.09])
-@pytest.mark.parametrize("backend", ["numba", "reference"])
 def test_all_points_lie_where_they_are_said_to_between_near_ones_of_their_time(gap, backend):
     points, times = samples_of_rays([1, 40, 0, 2, 100, 3], gap, dtype=torch.float64)
-    with kernels.use_backend(backend):
-        chosen, before, fractions = thin_out(points, times, 0.1)
+    chosen, before, fractions = thin_out(points, times, 0.1)
     assert len(chosen) < len(points)
     start, end = points[chosen][before], points[chosen][(before + 1).clamp(max=len(chosen) - 1)]
     torch.testing.assert_close(torch.lerp(start, end, fractions[:, None]), points)
     between = fractions > 0
     assert bool(((end - start).norm(dim=-1)[between] < 0.2).all())
-    assert torch.equal(times[chosen][before], times)
-    assert torch.equal(times[chosen][before + between], times)
+    assert all(torch.equal(times[chosen][which], times) for which in (before, before + between))
 
 
-def test_a_long_row_is_asked_once_per_spacing_and_at_its_end():
+def test_a_long_row_is_evaluated_once_per_spacing_and_at_its_end():
     points = torch.zeros(1001, 3, dtype=torch.float64)
     points[:, 1] = torch.arange(1001) / 1000
     chosen, _, _ = thin_out(points, torch.zeros(1001, dtype=torch.float64), 0.0995)
@@ -65,7 +57,6 @@ def test_a_long_row_is_asked_once_per_spacing_and_at_its_end():
     torch.testing.assert_close(places[1:-1], (torch.arange(1, 11) * 0.0995 * 1000).ceil().double() / 1000)
 
 
-@pytest.mark.parametrize("backend", ["numba", "reference"])
 @pytest.mark.parametrize(
     ("points", "times"),
     [
@@ -81,18 +72,18 @@ def test_a_long_row_is_asked_once_per_spacing_and_at_its_end():
     ],
 )
 def test_points_without_neighbours_on_both_sides_are_all_chosen(points, times, backend):
-    with kernels.use_backend(backend):
-        chosen, before, fractions = thin_out(torch.tensor(points).reshape(-1, 3), torch.tensor(times), 0.1)
+    chosen, before, fractions = thin_out(torch.tensor(points).reshape(-1, 3), torch.tensor(times), 0.1)
     assert chosen.tolist() == before.tolist() == list(range(len(times)))
     assert fractions.tolist() == [0] * len(times)
 
 
-@pytest.mark.parametrize("spacing", [0.0, -1.0, float("nan")])
-def test_a_spacing_that_is_not_positive_is_refused(spacing):
-    with pytest.raises(ValueError, match="spacing must be positive"):
-        thin_out(torch.zeros(2, 3), torch.zeros(2), spacing)
-
-
-def test_shapes_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"got \(2, 3\) and \(2, 1\)"):
-        thin_out(torch.zeros(2, 3), torch.zeros(2, 1), 0.1)
+@pytest.mark.parametrize(
+    ("times", "spacing", "message"),
+    [
+        *((torch.zeros(2), spacing, "spacing must be > 0") for spacing in (0.0, -1.0, float("nan"))),
+        (torch.zeros(2, 1), 0.1, r"times must have shape \(2,\), got \(2, 1\)"),
+    ],
+)
+def test_what_does_not_fit_is_refused(times, spacing, message):
+    with pytest.raises(ValueError, match=message):
+        thin_out(torch.zeros(2, 3), times, spacing)

@@ -8,16 +8,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernels.backends import under
 from torch import Tensor
 
-from dnerf.kernels import GridLevels, NetworkTables, grid_network, skip_distances, trace_network, use_backend
+from dnerf.kernels import FrameTables, GridLevels, grid_network, is_traced, skip_distances, trace_network
 from dnerf.kernels.cpu.dense import has_vectors
+from dnerf.kernels.grid_network import is_fused
 from dnerf.kernels.trace_network import trace_network_reference
 
 BOX = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 0.5, 1.5]])
 LEVELS = GridLevels([4, (9, 6, 7)], 1 << 12)
 WIDTHS = (8, 16, 16, 4)
-OPTIONS = {"step": 0.05, "splits": 3, "min_weight": 1e-3, "split_weight": 1e-2, "stop_transmittance": 1e-3}
+OPTIONS = {"step": 0.05, "subdivision": 3, "min_weight": 1e-3, "subdivision_weight": 1e-2, "stop_transmittance": 1e-3}
 
 pytestmark = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
 
@@ -38,22 +40,14 @@ def scene(seed: int = 0, *, known: float = 1.0, share: float = 0.3, density: flo
     is_known = torch.rand([c + 1 for c in reversed(cells)], generator=generator) < known
     displacements = (torch.rand(is_known.numel(), 4, generator=generator) - 0.5) * 2 * reach
     occupancy = torch.rand(16, 9, 12, generator=generator) < share
-    return NetworkTables(
-        occupancy=occupancy,
-        skips=skip_distances(occupancy[None])[0],
-        aabb=BOX,
-        displacements=torch.where(is_known.reshape(-1, 1), displacements, torch.nan),
-        is_known=is_known,
-        low=BOX[0],
-        sides=BOX[1] - BOX[0],
-        field_low=BOX[0] - 0.1,
-        field_scale=1 / (BOX[1] - BOX[0] + 0.2),
-        table=torch.randn(LEVELS.num_rows, 4, generator=generator),
-        shifts=torch.tensor([density, 0.1, -0.1, 0.3]),
-        levels=LEVELS,
+    return FrameTables(
+        occupancy=occupancy, skips=skip_distances(occupancy[None])[0], aabb=BOX, is_known=is_known, low=BOX[0],
+        displacements=torch.where(is_known.reshape(-1, 1), displacements, torch.nan), sides=BOX[1] - BOX[0],
+        field_low=BOX[0] - 0.1, field_scale=1 / (BOX[1] - BOX[0] + 0.2), levels=LEVELS,
+        table=torch.randn(LEVELS.num_rows, 4, generator=generator), shifts=torch.tensor([density, 0.1, -0.1, 0.3]),
         weights=[torch.randn(b, a, generator=generator) / a**0.5 for a, b in itertools.pairwise(WIDTHS)],
         biases=[torch.randn(b, generator=generator) for b in WIDTHS[1:]],
-    )
+    )  # fmt: skip
 
 
 def rays(count: int, seed: int = 0) -> tuple[Tensor, ...]:
@@ -68,12 +62,12 @@ def rays(count: int, seed: int = 0) -> tuple[Tensor, ...]:
     return origins, torch.nn.functional.normalize(targets - origins, dim=-1), near, far
 
 
-def both(bundle: tuple[Tensor, ...], is_left: Tensor, tables: NetworkTables, **options: float):
+def both(bundle: tuple[Tensor, ...], tables: FrameTables, **options: float):
     """What the kernel finds, and its definition."""
-    scalars = [options[name] for name in ("step", "min_weight", "split_weight", "stop_transmittance")]
+    scalars = [options[name] for name in ("step", "min_weight", "subdivision_weight", "stop_transmittance")]
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        found = trace_network(*bundle, is_left, tables, **options)
-        expected = trace_network_reference(is_left, list(bundle), tables, int(options["splits"]), scalars)
+        found = trace_network(*bundle, tables, **options)
+        expected = trace_network_reference(list(bundle), tables, int(options["subdivision"]), scalars)
     return found, expected
 
 
@@ -90,17 +84,15 @@ def assert_same(found: tuple[Tensor, Tensor], expected: tuple[Tensor, Tensor], c
     count=st.sampled_from([0, 1, 5, 64, 65, 300, 700]),
     known=st.sampled_from([1.0, 0.9]),
     density=st.sampled_from([-3.0, 2.0, 6.0]),
-    splits=st.sampled_from([1, 2, 3, 4]),
+    subdivision=st.sampled_from([1, 2, 3, 4]),
     stop=st.sampled_from([0.0, 1e-3, 0.1]),
     share=st.sampled_from([0.0, 0.3, 1.0]),
     seed=st.integers(0, 99),
 )
-def test_kernel_equals_definition(count, known, density, splits, stop, share, seed) -> None:
+def test_kernel_equals_definition(count, known, density, subdivision, stop, share, seed) -> None:
     tables = scene(seed, known=known, density=density, share=share)
-    is_left = torch.rand(count, generator=torch.Generator().manual_seed(seed)) < 0.1
-    options = OPTIONS | {"splits": splits, "stop_transmittance": stop}
-    found, expected = both(rays(count, seed), is_left, tables, **options)
-    assert not found[1][is_left].any()
+    options = OPTIONS | {"subdivision": subdivision, "stop_transmittance": stop}
+    found, expected = both(rays(count, seed), tables, **options)
     assert_same(found, expected, max(stop, 1e-3))
 
 
@@ -108,51 +100,42 @@ def test_closed_form_of_a_uniform_block() -> None:
     """A network of zeros leaves its shifts: density and colour are the same everywhere."""
     tables = scene(share=1.0, reach=0.0)
     nothing = {name: [torch.zeros_like(p) for p in getattr(tables, name)] for name in ("weights", "biases")}
-    tables = NetworkTables(**vars(tables) | nothing)
+    tables = FrameTables(**vars(tables) | nothing)
     origins = torch.tensor([[0.1, -3.0, 0.7], [-4.0, 0.2, 0.3]])
     directions = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     bundle = origins, directions, torch.zeros(2), torch.full((2,), 20.0)
-    for splits in (1, 3):
-        options = OPTIONS | {"splits": splits, "stop_transmittance": 0.0, "min_weight": 0.0, "split_weight": 0.0}
-        (states, is_done), _ = both(bundle, torch.zeros(2, dtype=torch.bool), tables, **options)
+    light = torch.exp(-tables.shifts[0].exp() * torch.tensor([1.0, 2.0]))
+    for subdivision in (1, 3):
+        options = dict.fromkeys(OPTIONS, 0.0) | {"step": 0.05, "subdivision": subdivision}
+        (states, is_done), _ = both(bundle, tables, **options)
         assert is_done.all()
-        light = torch.exp(-tables.shifts[0].exp() * torch.tensor([1.0, 2.0]))
         torch.testing.assert_close(states[:, 0], light, rtol=2e-5, atol=1e-7)
         torch.testing.assert_close(states[:, 1:4], (1 - light)[:, None] * torch.sigmoid(tables.shifts[1:]))
 
 
 def test_nan_of_the_network_is_shown_and_where_nothing_is_known_rays_say_so() -> None:
-    bundle, is_left, tables = rays(80), torch.zeros(80, dtype=torch.bool), scene(share=1.0)
-    poisoned = NetworkTables(**vars(tables) | {"table": torch.full_like(tables.table, torch.nan)})
-    (states, is_done), _ = both(bundle, is_left, poisoned, **OPTIONS)
+    bundle, tables = rays(80), scene(share=1.0)
+    poisoned = FrameTables(**vars(tables) | {"table": torch.full_like(tables.table, torch.nan)})
+    (states, is_done), _ = both(bundle, poisoned, **OPTIONS)
     assert is_done.all()
     assert states.isnan().any()
-    unknown = NetworkTables(**vars(tables) | {"displacements": torch.full_like(tables.displacements, torch.nan)})
-    (_, is_done), (_, expected) = both(bundle, is_left, unknown, **OPTIONS)
+    unknown = FrameTables(**vars(tables) | {"displacements": torch.full_like(tables.displacements, torch.nan)})
+    (_, is_done), (_, expected) = both(bundle, unknown, **OPTIONS)
     assert torch.equal(is_done, expected)
     assert 20 < int((~is_done).sum()) < 80  # the others meet nothing
 
 
 def test_rays_do_not_depend_on_their_neighbours() -> None:
     bundle, tables = rays(600), scene(density=4.0)
-    (whole, _), _ = both(bundle, torch.zeros(600, dtype=torch.bool), tables, **OPTIONS)
+    (whole, _), _ = both(bundle, tables, **OPTIONS)
     for some in (torch.arange(600).flip(0), torch.arange(0, 600, 7)):
-        part = tuple(x[some] for x in bundle)
-        (states, _), _ = both(part, torch.zeros(len(some), dtype=torch.bool), tables, **OPTIONS)
+        (states, _), _ = both(tuple(x[some] for x in bundle), tables, **OPTIONS)
         assert torch.equal(states, whole[some])
 
 
-def test_op_is_registered_properly() -> None:
-    tables = scene()
-    rounded = [[p.bfloat16() for p in parameters] for parameters in (tables.weights, tables.biases)]
-    arguments = (torch.zeros(20, dtype=torch.bool), list(rays(20)), tables.tensors(), LEVELS.cells, LEVELS.max_rows)
-    torch.library.opcheck(torch.ops.dnerf.trace_network.default, (*arguments, *rounded, 3, [0.05, 1e-3, 1e-2, 1e-3]))
-
-
 def test_other_backends_take_the_definition() -> None:
-    bundle, is_left, tables = rays(50), torch.zeros(50, dtype=torch.bool), scene()
-    with use_backend("reference"):
-        states, is_done = trace_network(*bundle, is_left, tables, **OPTIONS)
+    bundle, tables = rays(50), scene()
+    states, is_done = under("reference", trace_network, *bundle, tables, **OPTIONS)
     assert is_done.all()
     assert bool((states[:, 0] < 0.9).any())
 
@@ -169,12 +152,22 @@ def test_other_backends_take_the_definition() -> None:
 )
 def test_wrong_tables_are_refused(wrong: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        NetworkTables(**vars(scene()) | wrong)
+        FrameTables(**vars(scene()) | wrong)
 
 
-def test_wrong_rays_are_refused() -> None:
-    bundle, is_left = rays(5), torch.zeros(5, dtype=torch.bool)
-    with pytest.raises(ValueError, match="is_left must have shape"):
-        trace_network(*bundle, is_left[:3], scene(), **OPTIONS)
-    with pytest.raises(ValueError, match="splits must be positive"):
-        trace_network(*bundle, is_left, scene(), **OPTIONS | {"splits": 0})
+@pytest.mark.parametrize(("count", "subdivision", "message"), [(3, 3, r"near .* got \(3,\)"), (5, 0, "subdivision")])
+def test_wrong_rays_are_refused(count: int, subdivision: int, message: str) -> None:
+    origins, directions, near, far = rays(5)
+    with pytest.raises(ValueError, match=message):
+        trace_network(origins, directions, near[:count], far, scene(), **OPTIONS | {"subdivision": subdivision})
+
+
+def test_processors_that_multiply_tiles_are_served_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There matrix libraries are as quick at layers alone, but not at whole rays."""
+    monkeypatch.setattr("dnerf.kernels.cpu.grid_network.is_supported", lambda: False)
+    tables = scene()
+    network = tables.table, tables.weights[0].shape[1], tables.weights
+    with torch.autocast("cpu", torch.bfloat16):
+        assert is_traced(*network)
+        assert not is_fused(*network)
+    assert not is_traced(*network)  # in float32 nothing is

@@ -12,7 +12,7 @@ def compile_kernels():
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    from dnerf.kernels.gpu import brick_lookup, grid_encode, march, packed
+    from dnerf.kernels.gpu import grid_encode, march, packed
 
     grid = {"num_features": 8, "width": 8, "block": 128}
     marching = {"num_slabs": 16, "nx": 128, "ny": 128, "nz": 64, "block": 64}
@@ -20,17 +20,13 @@ def compile_kernels():
         (grid_encode._forward, grid),
         (grid_encode._grad_table, grid),
         (grid_encode._grad_positions, grid),
-        (brick_lookup._lookup, {"num_features": 4, "width": 4, "block": 128}),
         (packed._weights, {"terms": 9, "block": 128}),
         (packed._grad_optical_depth, {"block": 128}),
         (packed._sums, {"weighted": True, "block": 32, "width": 4}),
         (march._march, marching | {"fill": False}),
         (march._march, marching | {"fill": True}),
     ]
-    kinds = {"occupancy": "*u8", "limit": "i64"}
-    kinds |= dict.fromkeys(("num_samples", "num_levels", "num_columns"), "i32")
-    kinds |= dict.fromkeys(("count", "bx", "by", "bz"), "i32")
-    kinds |= {"slots": "*i64", "known": "*i1"}
+    kinds = {"occupancy": "*u8", "limit": "i64"} | dict.fromkeys(("num_samples", "num_levels", "num_columns"), "i32")
     kinds |= dict.fromkeys(("levels", "offsets", "ray_indices"), "*i64")
     for real in ("*fp32", "*fp64"):
         for kernel, constants in kernels:

@@ -1,33 +1,33 @@
-"""Importance sampling: fine samples go where the coarse pass sees matter; only an own proposal is trained."""
+"""Importance sampling: fine samples go where the coarse pass finds density; only an own proposal is trained."""
 
 import pytest
 import torch
-from reference import FormulaField, fog, rays_towards_origin, soft_ball
+from reference import FormulaField, rays_towards_origin, soft_ball
 from torch import Tensor
 
-from dnerf.compositing import composite
+from dnerf.core.compositing import composite
 from dnerf.fields import FieldOutput, NeRFField, RadianceField
-from dnerf.losses import PhotometricLoss
-from dnerf.renderer import Renderer
+from dnerf.losses import Batch, PhotometricLoss
+from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import ImportanceSampler, Sampler, StratifiedSampler
 
 
 class Shell(RadianceField):
-    """A thin opaque shell of radius 1, that counts what it is asked."""
+    """A thin opaque shell of radius 1, that lists what is evaluated."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.asked: list[str] = []
+        self.evaluated: list[str] = []
 
     def _density(self, positions: Tensor) -> Tensor:
         return 100 * torch.exp(-0.5 * ((positions.norm(dim=-1) - 1) / 0.05) ** 2)
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
-        self.asked.append("density")
+        self.evaluated.append("density")
         return self._density(positions)
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
-        self.asked.append("all")
+        self.evaluated.append("all")
         return FieldOutput(self._density(positions), torch.ones_like(positions))
 
 
@@ -39,7 +39,7 @@ def test_fine_samples_gather_where_the_weight_is() -> None:
     rays = rays_towards_origin(40, torch.float64)
     hits = torch.linalg.cross(rays.origins, rays.directions).norm(dim=-1) < 0.9
     samples = ImportanceSampler(64, 64).eval()(rays, Shell())
-    distances = samples.positions(rays).norm(dim=-1)
+    distances = samples.locate(rays)[0].norm(dim=-1)
     near_shell = ((distances - 1).abs() < 0.15) & (samples.distances < 3.5)
     share = near_shell.double().mean(-1)[hits]
     # All 64 drawn edges and the few coarse ones there: half of the samples, on a twentieth of the ray.
@@ -47,7 +47,7 @@ def test_fine_samples_gather_where_the_weight_is() -> None:
     assert (share > 0.45).all()
 
 
-def test_there_are_as_many_intervals_as_asked_for_and_they_cover_the_ray() -> None:
+def test_there_are_as_many_intervals_as_evaluated_for_and_they_cover_the_ray() -> None:
     samples = ImportanceSampler(8, 12).eval()(rays_towards_origin(5), soft_ball())
     assert samples.starts.shape == (5, 20)
     assert torch.equal(samples.starts[:, 1:], samples.ends[:, :-1])
@@ -61,7 +61,7 @@ def test_importance_sampling_finds_a_surface_better_than_equal_intervals() -> No
 
     def depth(sampler: Sampler) -> Tensor:
         samples = sampler.eval()(rays, ball)
-        return composite(samples, ball(samples.positions(rays), rays.directions, samples.distances)).depth
+        return composite(samples, ball(samples.locate(rays)[0], rays.directions, samples.distances)).depth
 
     half_chord = (0.5**2 - torch.linalg.cross(rays.origins, rays.directions).square().sum(-1)).clamp(min=0).sqrt()
     hits = half_chord > 0.1
@@ -77,51 +77,41 @@ def test_importance_sampling_finds_a_surface_better_than_equal_intervals() -> No
     assert importance < 0.75 * equal
 
 
-def test_shared_network_is_asked_for_density_alone_without_gradient() -> None:
+def test_shared_network_is_evaluated_for_density_alone_without_gradient() -> None:
     shell = Shell()
     samples = ImportanceSampler(8, 8)(rays_towards_origin(3), shell)
-    assert shell.asked == ["density"]
+    assert shell.evaluated == ["density"]
     assert samples.proposals == ()
 
 
-def test_own_proposal_is_asked_instead_of_the_field() -> None:
+def test_own_proposal_is_evaluated_instead_of_the_field() -> None:
     field, proposal = Shell(), Shell()
     samples = ImportanceSampler(8, 8, proposal)(rays_towards_origin(3), field)
-    assert (field.asked, proposal.asked) == ([], ["all"])
+    assert (field.evaluated, proposal.evaluated) == ([], ["all"])
     ((coarse, output),) = samples.proposals
     assert coarse.starts.shape == output.density.shape == (3, 8)
 
 
 @pytest.mark.parametrize("own", [True, False])
-def test_only_an_own_proposal_is_trained_by_the_coarse_picture(own: bool) -> None:
+def test_only_an_own_proposal_is_trained_by_the_coarse_image(own: bool) -> None:
     field, proposal = small_nerf(), small_nerf() if own else None
     renderer = Renderer(field, ImportanceSampler(8, 8, proposal))
     rendering = renderer(rays_towards_origin(20), generator=torch.Generator().manual_seed(0))
     assert len(rendering.proposals) == own
-    PhotometricLoss()(rendering, torch.rand(20, 3), renderer).backward()
+    PhotometricLoss()(rendering, Batch(torch.rand(20, 4), torch.rand(20, 3)), renderer).backward()
     assert all(torch.count_nonzero(p.grad) for p in field.parameters())
     if proposal is not None:
         assert all(torch.count_nonzero(p.grad) for p in proposal.parameters())
 
 
 def test_placing_samples_sends_no_gradient() -> None:
-    """With the coarse pictures' weight at zero, an own proposal must not be pulled by the fine picture."""
+    """With the coarse images' weight at zero, an own proposal must not be pulled by the fine image."""
     proposal = small_nerf()
     renderer = Renderer(small_nerf(), ImportanceSampler(8, 8, proposal))
     rendering = renderer(rays_towards_origin(20))
-    PhotometricLoss(proposal_weight=0)(rendering, torch.rand(20, 3), renderer).backward()
+    batch = Batch(torch.rand(20, 4), torch.rand(20, 3))
+    PhotometricLoss(proposal_weight=0)(rendering, batch, renderer).backward()
     assert not any(torch.count_nonzero(p.grad) for p in proposal.parameters() if p.grad is not None)
-
-
-def test_proposal_belongs_to_the_model() -> None:
-    sampler = ImportanceSampler(8, 8, small_nerf())
-    assert len(list(sampler.parameters())) == len(list(small_nerf().parameters()))
-    assert list(ImportanceSampler(8, 8).parameters()) == []
-
-
-def test_uniform_fog_leaves_samples_spread() -> None:
-    samples = ImportanceSampler(8, 64).eval()(rays_towards_origin(3, torch.float64), fog(1e-6))
-    assert samples.lengths.max() < 3 * 4 / 64
 
 
 @pytest.mark.parametrize(("counts", "name"), [((0, 8), "num_samples"), ((8, 0), "num_fine")])

@@ -47,18 +47,6 @@ def gap_between(edges: list[float], weights: list[float], low: float, high: floa
     return between <= 1e-9 * sum(weights)
 
 
-@pytest.mark.parametrize("randomized", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_draws_are_sorted_and_within_the_edges(randomized: bool, dtype: torch.dtype) -> None:
-    edges = torch.rand(200, 17, dtype=dtype).cumsum(-1)
-    weights = torch.rand(200, 16, dtype=dtype) ** 20
-    drawn = sample_piecewise_constant(edges, weights, 33, randomized=randomized, generator=seeded())
-    assert drawn.dtype == dtype
-    assert (drawn.diff(dim=-1) >= 0).all()
-    assert (drawn >= edges[:, :1]).all()
-    assert (drawn <= edges[:, -1:]).all()
-
-
 @pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-45])
 def test_a_histogram_without_weight_is_sampled_uniformly(scale: float) -> None:
     edges = torch.linspace(2, 6, 9).expand(3, 9)
@@ -97,15 +85,6 @@ def test_extreme_random_numbers_stay_out_of_empty_bins(monkeypatch: pytest.Monke
     assert (drawn <= 4).all()
 
 
-def test_huge_dynamic_range_keeps_its_proportions() -> None:
-    weights = torch.tensor([[1e-30, 1e10, 1e-20, 1e10, 1e-4]])
-    edges = torch.arange(6.0)[None]
-    drawn = sample_piecewise_constant(edges, weights, 100)[0]
-    assert ((drawn >= 1) & (drawn <= 2)).sum().item() == 50
-    assert ((drawn >= 3) & (drawn <= 4)).sum().item() == 50
-    assert torch.isfinite(drawn).all()
-
-
 def test_random_draws_follow_the_histogram() -> None:
     """One draw for each of many rays is an independent sample; counts in half bins also show that bins are uniform."""
     count = 40000
@@ -132,33 +111,17 @@ def test_strata_spread_draws_better_than_chance() -> None:
     assert torch.equal((8 * drawn).floor(), torch.arange(8.0).expand(100, 8))
 
 
-def test_random_draws_follow_their_generator() -> None:
-    edges, weights = torch.linspace(0, 1, 5).expand(3, 5), torch.rand(3, 4)
-    first, again, other = (
-        sample_piecewise_constant(edges, weights, 5, randomized=True, generator=seeded(seed)) for seed in (1, 1, 2)
-    )
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-
-
 def test_no_gradient_flows() -> None:
     weights = torch.rand(2, 4, requires_grad=True)
     edges = torch.linspace(0, 1, 5).expand(2, 5).clone().requires_grad_()
     assert not sample_piecewise_constant(edges, weights, 3).requires_grad
 
 
-def test_no_rays_give_no_draws() -> None:
-    assert sample_piecewise_constant(torch.empty(0, 5), torch.empty(0, 4), 3).shape == (0, 3)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: sample_piecewise_constant(torch.zeros(2, 4), torch.zeros(2, 4), 3), r"edges must have shape \(2, 5\)"),
-        (lambda: sample_piecewise_constant(torch.zeros(5), torch.zeros(4), 3), r"weights must have shape \(R, S\)"),
-        (lambda: sample_piecewise_constant(torch.zeros(2, 5), torch.zeros(2, 4), 0), "num_samples must be > 0"),
-    ],
-)
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda: sample_piecewise_constant(torch.zeros(2, 4), torch.zeros(2, 4), 3), r"edges must have shape \(2, 5\)"),
+    (lambda: sample_piecewise_constant(torch.zeros(5), torch.zeros(4), 3), r"weights must have shape \(R, S\)"),
+    (lambda: sample_piecewise_constant(torch.zeros(2, 5), torch.zeros(2, 4), 0), "num_samples must be > 0"),
+])  # fmt: skip
 def test_arguments_that_do_not_fit_are_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()

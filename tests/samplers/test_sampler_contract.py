@@ -1,22 +1,22 @@
 """What every sampler must do. A new one is one line in `SAMPLERS`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from reference import fog, rays_towards_origin, soft_ball
+from reference import fog, occupancy_sampler, rays_towards_origin, soft_ball
 
-from dnerf.compositing import composite
-from dnerf.rays import Rays, Samples
-from dnerf.samplers import ImportanceSampler, OccupancySampler, Sampler, StratifiedSampler
+from dnerf.core.compositing import composite
+from dnerf.core.rays import Rays, Samples
+from dnerf.samplers import ImportanceSampler, Sampler, StratifiedSampler
 
 BOX = torch.tensor([[-1.0, -1.2, -0.8], [0.9, 1.1, 1.3]])
 
 
 def filled_occupancy() -> Sampler:
-    sampler = OccupancySampler(BOX.tolist(), 0.05, 16, num_slabs=2)
-    sampler.fill(soft_ball())
+    sampler = occupancy_sampler(BOX.tolist(), 0.05, 16, num_slabs=2)
+    sampler.grid.fill(soft_ball())
     return sampler
 
 
@@ -26,7 +26,7 @@ SAMPLERS: dict[str, Callable[[], Sampler]] = {
     "stratified in a box": lambda: StratifiedSampler(16, BOX),
     "importance, shared network": lambda: ImportanceSampler(8, 12),
     "importance, own proposal": lambda: ImportanceSampler(8, 12, soft_ball(width=0.6)),
-    "occupancy, all of a box": lambda: OccupancySampler(BOX.tolist(), 0.1, 8, num_slabs=4),
+    "occupancy, all of a box": lambda: occupancy_sampler(BOX.tolist(), 0.1, 8, num_slabs=4),
     "occupancy, filled": filled_occupancy,
     "importance, linear": lambda: ImportanceSampler(8, 12, box=BOX, quadrature="linear"),
     "importance in a box": lambda: ImportanceSampler(8, 12, box=BOX),
@@ -104,7 +104,7 @@ def test_empty_ray_shows_background(name: str, training: bool, length: float) ->
     rays = rays_towards_origin(6)
     rays = Rays(rays.origins, rays.directions, rays.times, rays.near, rays.near + length)
     samples = sample(name, rays, training)
-    output = fog(1e6)(samples.positions(rays), samples.per_sample(rays.directions), samples.per_sample(rays.times))
+    output = fog(1e6)(samples.locate(rays)[0], samples.per_sample(rays.directions), samples.per_sample(rays.times))
     background = torch.rand(6, 3)
     rendering = composite(samples, output, background)
     assert torch.equal(rendering.rgb, background)
@@ -163,13 +163,43 @@ def test_rays_do_not_see_each_other(name: str) -> None:
                 assert (a.start, a.end, a.point) == pytest.approx((b.start, b.end, b.point), rel=1e-12)
 
 
+def shown(name: str, rays: Rays, training: bool, samples: Samples | None = None) -> torch.Tensor:
+    """Colours (R, 3) of a soft ball's rays, at samples of their own or at given ones."""
+    samples = sample(name, rays, training) if samples is None else samples
+    return composite(samples, soft_ball()(*samples.locate(rays))).rgb
+
+
+@pytest.mark.parametrize("name", ["stratified", "stratified, one sample", "stratified in a box"])
+@both_modes
+def test_stratified_gradients_to_rays_are_those_of_what_is_rendered(name: str, training: bool) -> None:
+    """Also where a box cuts rays off: camera poses may be fitted by them."""
+    rays = rays_towards_origin(4, torch.float64)
+
+    def render(origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        return shown(name, replace(rays, origins=origins, directions=directions), training)
+
+    leaves = rays.origins.clone().requires_grad_(), rays.directions.clone().requires_grad_()
+    assert torch.autograd.gradcheck(render, leaves)
+
+
 @every_sampler
 @both_modes
-def test_no_gradient_flows_to_where_samples_lie(name: str, training: bool) -> None:
-    samples = sample(name, rays_towards_origin(5), training)
-    assert not samples.starts.requires_grad
-    assert not samples.ends.requires_grad
-    assert not samples.distances.requires_grad
+def test_other_samplers_hold_distances_fixed(name: str, training: bool) -> None:
+    """Their gradients to rays are those of the same samples, wherever these would have moved."""
+    if name.startswith("stratified"):
+        pytest.skip("its samples move with the rays")
+    rays = rays_towards_origin(6, torch.float64)
+    held = sample(name, rays, training)
+    held = replace(held, starts=held.starts.detach(), ends=held.ends.detach(), points=held.distances.detach())
+    found = []
+    for samples in (None, held):
+        origins = rays.origins.clone().requires_grad_()
+        shown(name, replace(rays, origins=origins), training, samples).sum().backward()
+        found.append(origins.grad)
+    if name in ("importance, linear", "importance in a box"):  # whose coarse edges end where the box does
+        assert not torch.equal(*found)
+        return
+    torch.testing.assert_close(*found, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", [name for name in SAMPLERS if "box" in name])
@@ -188,10 +218,3 @@ def test_samples_stay_in_the_box_and_cover_it(name: str, training: bool) -> None
             # To the spacing of the brute-force points, 0.002.
             assert row[0].start == pytest.approx(distances[inside][0].item(), abs=0.0021)
             assert row[-1].end == pytest.approx(distances[inside][-1].item(), abs=0.0021)
-
-
-@every_sampler
-def test_update_may_be_called_at_any_step(name: str) -> None:
-    sampler = SAMPLERS[name]()
-    sampler.update(soft_ball(), 0)
-    sampler.update(soft_ball(), 1000)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from reference import fog, rays_towards_origin
 
-from dnerf.rays import Rays
+from dnerf.core.rays import Rays
 from dnerf.samplers import StratifiedSampler
 
 

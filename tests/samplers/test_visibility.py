@@ -1,4 +1,4 @@
-"""Only what can be seen is kept: nothing empty, nothing behind a surface, and the picture stays."""
+"""Only what can be seen is kept: nothing empty, nothing behind a surface, and the image stays."""
 
 import math
 from collections.abc import Callable
@@ -7,18 +7,17 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import FormulaField, fog, ray_weights, rays_towards_origin
+from reference import FormulaField, fog, occupancy_sampler, ray_weights, rays_towards_origin
 from torch import Tensor
 
-from dnerf.compositing import composite
+from dnerf.core.compositing import composite
+from dnerf.core.rays import Rays, Samples
 from dnerf.fields import RadianceField
-from dnerf.rays import Rays, Samples
-from dnerf.samplers import OccupancySampler
 from dnerf.samplers.visibility import joined, visible_weights
 
 
 class CountingField(FormulaField):
-    """A field that remembers at how many points it was asked."""
+    """A field that remembers at how many points it was evaluated."""
 
     num_points = 0
 
@@ -93,29 +92,29 @@ def test_weights_are_those_of_a_loop(
 
 
 @pytest.mark.parametrize("min_weight", [1e-2, 1e-3, 1e-4])
-def test_picture_changes_by_no_more_than_the_stated_bound(min_weight: float) -> None:
+def test_image_changes_by_no_more_than_the_stated_bound(min_weight: float) -> None:
     rays = rays_towards_origin(200)
     field = FormulaField(lambda x: torch.exp(-20 * x.square().sum(-1)) * 60, lambda x, d, t: torch.sigmoid(3 * x))
     box = [[-1.0] * 3, [1.0] * 3]
-    whole, culled = OccupancySampler(box, 0.02).train(), OccupancySampler(box, 0.02, min_weight=min_weight).train()
-    pictures, numbers = [], []
+    whole, culled = occupancy_sampler(box, 0.02).train(), occupancy_sampler(box, 0.02, min_weight=min_weight).train()
+    images, numbers = [], []
     for sampler in (whole, culled):
         samples = sampler(rays, field, generator=torch.Generator().manual_seed(0))
-        pictures.append(composite(samples, field(*samples.locate(rays)), torch.ones(3)).rgb)
+        images.append(composite(samples, field(*samples.locate(rays)), torch.ones(3)).rgb)
         numbers.append(int((samples.lengths > 0).sum()))
     most_samples = math.ceil(2 * math.sqrt(3) / 0.02) + 1
-    assert (pictures[0] - pictures[1]).abs().max() <= min_weight * (most_samples + 1)
+    assert (images[0] - images[1]).abs().max() <= min_weight * (most_samples + 1)
     assert numbers[1] < 0.6 * numbers[0]
 
 
-def test_what_lies_behind_a_surface_is_not_even_asked() -> None:
+def test_what_lies_behind_a_surface_is_not_even_evaluated() -> None:
     rays = rays_towards_origin(64)
     field = ball()
-    samples = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, pad_to=1).eval()(rays, field)
+    samples = occupancy_sampler([[-1.0] * 3, [1.0] * 3], 0.02, pad_to=1).eval()(rays, field)
     is_seen = visible_weights(samples, rays, field, 1e-4) > 1e-4
     assert field.num_points < 0.5 * len(samples.starts)
     # Density 200 over steps of 0.02: three intervals leave exp(-12) of the light.
-    inside = samples.positions(rays).norm(dim=-1) < 0.9
+    inside = samples.locate(rays)[0].norm(dim=-1) < 0.9
     assert not (is_seen & ~inside).any()
     assert is_seen.any()
     assert torch.bincount(samples.ray_indices[is_seen], minlength=64).max() <= 3
@@ -124,42 +123,31 @@ def test_what_lies_behind_a_surface_is_not_even_asked() -> None:
 def test_a_thin_start_keeps_every_sample() -> None:
     """Before training every sample has weight, and each must get a gradient."""
     rays = rays_towards_origin(16)
-    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-4, pad_to=1).train()
-    everything = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, pad_to=1).train()
+    sampler = occupancy_sampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-4, pad_to=1).train()
+    everything = occupancy_sampler([[-1.0] * 3, [1.0] * 3], 0.02, pad_to=1).train()
     kept, samples = (s(rays, fog(0.3), generator=torch.Generator().manual_seed(0)) for s in (sampler, everything))
     # The box's edges may cut off a sliver too thin to weigh anything.
     assert torch.isin(samples.starts[samples.lengths > 0.01], kept.starts).all()
 
 
-def test_nothing_visible_leaves_no_samples() -> None:
-    rays = rays_towards_origin(16)
-    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-4).train()
-    samples = sampler(rays, fog(0.0))
-    assert samples.starts.shape == (0,)
-    assert composite(samples, fog(0.0)(*samples.locate(rays)), torch.ones(3)).rgb.eq(1).all()
-
-
 def test_occupancy_learns_from_the_samples_that_are_dropped() -> None:
     """The density of a dropped sample counts like that of a kept one."""
-    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, 16, min_weight=1e-4).train()
+    sampler = occupancy_sampler([[-1.0] * 3, [1.0] * 3], 0.02, 16, min_weight=1e-4).train()
     density: Callable[[Tensor], Tensor] = lambda x: torch.full_like(x[..., 0], 1e-3)  # noqa: E731
     samples = sampler(rays_towards_origin(64), FormulaField(density, lambda x, d, t: x))
     assert samples.starts.shape == (0,)
-    assert bool((sampler.maxima == 1e-3).any())
+    assert bool((sampler.grid.maxima == 1e-3).any())
 
 
 def test_evaluation_keeps_every_sample_in_occupied_cells() -> None:
-    """Pictures without gradients end rays early while they are shaded; filtering before would ask twice."""
+    """Images without gradients end rays early while they are shaded; filtering before would evaluate twice."""
     rays = rays_towards_origin(64)
-    plain, filtering = (OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=w).eval() for w in (0.0, 1e-2))
+    plain, filtering = (occupancy_sampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=w).eval() for w in (0.0, 1e-2))
     assert torch.equal(plain(rays, ball()).starts, filtering(rays, ball()).starts)
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    st.lists(st.lists(st.integers(0, 3), max_size=20), min_size=1, max_size=5),
-    st.integers(1, 4),
-)
+@given(st.lists(st.lists(st.integers(0, 3), max_size=20), min_size=1, max_size=5), st.integers(1, 4))
 def test_joined_intervals_are_those_of_a_loop(gaps: list[list[int]], most: int) -> None:
     """Intervals of length one, each so far behind the one before on its ray; those without a gap touch."""
     counts = [len(g) for g in gaps]
@@ -192,47 +180,32 @@ def test_joining_wants_packed_samples() -> None:
         joined(dense, 2)
 
 
-def test_a_filter_that_asks_for_pairs_keeps_what_matters_at_half_the_price() -> None:
+def test_a_filter_that_evaluates_pairs_keeps_what_counts_at_half_the_price() -> None:
     rays, box = rays_towards_origin(200), [[-1.0] * 3, [1.0] * 3]
-    pictures, asked = [], []
+    images, evaluated = [], []
     for joins in (1, 2):
         field, thin = ball(), ball(0.1)
-        sampler = OccupancySampler(box, 0.02, min_weight=1e-4, filter_joins=joins, pad_to=1).train()
+        sampler = occupancy_sampler(box, 0.02, min_weight=1e-4, filter_joins=joins, pad_to=1).train()
         sampler(rays, thin, generator=torch.Generator().manual_seed(0))
-        asked.append(thin.num_points)
+        evaluated.append(thin.num_points)
         samples = sampler(rays, field, generator=torch.Generator().manual_seed(0))
-        pictures.append(composite(samples, field(*samples.locate(rays)), torch.ones(3)).rgb)
-    assert asked[1] < 0.52 * asked[0]  # an odd one out on each ray
+        images.append(composite(samples, field(*samples.locate(rays)), torch.ones(3)).rgb)
+    assert evaluated[1] < 0.52 * evaluated[0]  # an odd one out on each ray
     # A pair is looked at in its middle: the surface's outermost interval can be missed where the middle is outside,
     # after which the next three of density 200 and length 0.02 still leave no more than exp(-12) of the light.
-    assert (pictures[0] - pictures[1]).abs().mean() < 0.01
+    assert (images[0] - images[1]).abs().mean() < 0.01
 
 
-def test_haze_is_asked_in_rounds_of_bounded_size() -> None:
+def test_the_filter_evaluates_no_more_at_once_than_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes: list[int] = []
 
-    class Haze(FormulaField):
-        def density(self, positions: Tensor, times: Tensor) -> Tensor:
-            sizes.append(len(times))
-            return torch.full_like(times, 1e-3)
-
-    rays, samples = packed([50] * 30)
-    field = Haze(lambda x: x[..., 0], lambda x, d, t: x)
-    visible_weights(samples, rays, field, 1e-6, first_round=64, most_at_once=100)
-    assert sum(sizes) == 1500
-    assert max(sizes) <= 100
-
-
-def test_the_filter_asks_no_more_of_haze_at_once_than_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes: list[int] = []
-
-    class Haze(FormulaField):
+    class Fog(FormulaField):
         def density(self, positions: Tensor, times: Tensor) -> Tensor:
             sizes.append(len(times))
             return torch.full_like(times, 1e-3)
 
     monkeypatch.setattr("dnerf.samplers.occupancy.MOST_AT_ONCE", 200)
-    sampler = OccupancySampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-7, pad_to=1).train()
-    samples = sampler(rays_towards_origin(64), Haze(lambda x: x[..., 0], lambda x, d, t: x))
+    sampler = occupancy_sampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-7, pad_to=1).train()
+    samples = sampler(rays_towards_origin(64), Fog(lambda x: x[..., 0], lambda x, d, t: x))
     assert samples.starts.numel() > 2000  # rays of some fifty intervals or more, all of them kept
     assert max(sizes) <= 200

@@ -1,4 +1,4 @@
-"""Pictures by a slow and independent road: edges by bisection of what the field says, then fine quadrature."""
+"""Rays, and images by a slow and independent way: edges by bisection of the field's values, then fine quadrature."""
 
 import math
 
@@ -6,12 +6,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dnerf.compositing import FieldOutput
-from dnerf.rays import Rays
+from dnerf.core.compositing import FieldOutput
+from dnerf.core.rays import Rays
 from dnerf.scenes import AnalyticScene
 
+START = [-2.0, 0.0, 0.0]
 COLOR_JUMP = 0.02
 """Smooth textures change less than this over the steps of the first scan (1e-3): slopes stay below 20."""
+
+
+def make_rays(origins=(START,), directions=((1.0, 0.0, 0.0),), *, near=0.0, far=6.0, times=0.0) -> Rays:
+    """Rays along the x axis unless stated otherwise."""
+    origin, direction = (torch.tensor(x, dtype=torch.float64) for x in (origins, directions))
+    direction = torch.nn.functional.normalize(direction, dim=-1).expand_as(origin)
+    one = torch.ones_like(origin[:, 0])
+    return Rays(origin, direction, torch.tensor(times, dtype=torch.float64) * one, near * one, far * one)
 
 
 def field_on_ray(scene: AnalyticScene, ray: Rays, distances: Tensor) -> FieldOutput:
@@ -31,10 +40,9 @@ def find_edges(scene: AnalyticScene, ray: Rays) -> Tensor:
     low, high, width = ray.near, ray.far, (ray.far - ray.near).item()
     for steps in (6000, 300):
         grid = (low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, steps + 1, dtype=low.dtype)).flatten()
-        said = field_on_ray(scene, ray, grid)
-        jumps = differs(
-            FieldOutput(said.density[:-1], said.rgb[:-1]), FieldOutput(said.density[1:], said.rgb[1:])
-        ).nonzero()[:, 0]
+        values = field_on_ray(scene, ray, grid)
+        left, right = (FieldOutput(values.density[s], values.rgb[s]) for s in (slice(0, -1), slice(1, None)))
+        jumps = differs(left, right).nonzero()[:, 0]
         width /= steps
         within = grid[jumps + 1] - grid[jumps] < 2 * width  # not from one bracket of the first scan to the next
         low, high = grid[jumps[within]], grid[jumps[within] + 1]

@@ -9,6 +9,7 @@ import runpy
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,25 @@ class Run:
         name: of the script, without `.py`.
         arguments: of its command line.
         cwd: its working directory.
+        user: as which it runs; None for the same.
+        environment: variables beside those of this process.
     """
 
     _server: subprocess.Popen[str] | None = None
 
-    def __init__(self, name: str, *arguments: object, cwd: Path, user: int | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        *arguments: object,
+        cwd: Path,
+        user: int | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         self._folder = tempfile.TemporaryDirectory()
         Path(self._folder.name).chmod(0o777)
         request = {
             "script": str(ROOT / "scripts" / f"{name}.py"), "arguments": [str(a) for a in arguments], "cwd": str(cwd),
-            "output": self._folder.name, "user": user,
+            "output": self._folder.name, "user": user, "environment": dict(environment or {}),
         }  # fmt: skip
         self.pid = int(self._ask(request))
 
@@ -55,9 +65,9 @@ class Run:
         return cls._server.stdout.readline()
 
 
-def run_script(name: str, *arguments: object, cwd: Path, user: int | None = None) -> "subprocess.CompletedProcess[str]":
+def run_script(name: str, *arguments: object, cwd: Path, **settings: Any) -> "subprocess.CompletedProcess[str]":
     """Run a script to its end."""
-    return Run(name, *arguments, cwd=cwd, user=user).wait()
+    return Run(name, *arguments, cwd=cwd, **settings).wait()
 
 
 def fork(request: dict[str, Any]) -> int:
@@ -72,6 +82,8 @@ def fork(request: dict[str, Any]) -> int:
             os.dup2(os.open(f"{request['output']}/{kind}", os.O_WRONLY | os.O_CREAT, 0o666), number)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         os.chdir(request["cwd"])
+        os.environ.update(request["environment"])
+        sys.path += filter(None, request["environment"].get("PYTHONPATH", "").split(os.pathsep))
         if request["user"] is not None:
             os.setgid(request["user"])
             os.setuid(request["user"])

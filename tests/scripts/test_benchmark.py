@@ -6,7 +6,7 @@ import benchmark
 import pytest
 from omegaconf import OmegaConf
 
-from dnerf.benchmarks import SuiteResult, Table
+from benchmarks import SuiteResult, Table
 
 pytest.importorskip("matplotlib")
 

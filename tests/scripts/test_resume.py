@@ -11,6 +11,8 @@ import pytest
 import yaml
 from launcher import Run, run_script
 
+from dnerf.training.tensor_files import decode
+
 SETTINGS = (
     "experiment=demo",
     "data.resolution=16",
@@ -21,12 +23,12 @@ SETTINGS = (
     "trainer.num_rays=32",
     "trainer.target_samples=1024",
     "trainer.log_every=1",
-    "trainer.checkpoint_every=8",
-    "trainer.progress_bar=false",
+    "trainer.callbacks.checkpoints.every=8",
+    "~trainer.callbacks.progress_bar",
     "field.resolutions=[8,16]",
-    "sampler.resolution=16",
-    "sampler.num_slabs=4",
-    "sampler.num_probes=1024",
+    "sampler.grid.resolution=16",
+    "sampler.grid.num_slabs=4",
+    "+sampler.grid.num_probes=1024",
 )
 STEPS = 24
 
@@ -81,48 +83,43 @@ def test_a_signal_saves_and_the_run_continues_bit_for_bit(
         assert [line["step"] for line in log_lines(run)] == list(range(1, step + 3))
 
 
-LARGE = "data.box=[[-4,-4,-4],[4,4,4]]"
-
-
-def test_a_run_in_a_box_that_is_too_large_goes_on_in_less_and_can_be_continued(tmp_path: Path) -> None:
-    done = train(tmp_path, LARGE, "trainer.num_steps=4")
-    assert done.returncode == 0, done.stderr
-    assert "beginning anew" in done.stdout
-    run = tmp_path / "run"
-    config = yaml.safe_load((run / "config.yaml").read_text())
+def test_the_box_is_fitted_once_saved_and_agrees_with_auto(tmp_path: Path, whole: Path) -> None:
+    config = yaml.safe_load((whole / "config.yaml").read_text())
     box = config["data"]["box"]
-    assert max(high - low for low, high in zip(*box)) < 7.2
-    assert config["box_fit"] == {"given": [[-4, -4, -4], [4, 4, 4]], "seconds": 0.0}
-    places = [config["sampler"], config["field"], config["renderer"]["sampler"], config["renderer"]["field"]["baking"]]
-    assert all(place["box"] == box for place in [*places, config["trainer"]["losses"]["hidden_matter"]])
-    assert [line["step"] for line in log_lines(run)] == [1, 2, 3, 4]
-    for named in ((), (LARGE,), (*SETTINGS, LARGE)):  # as it was given, the box is no other one
-        steps = f"trainer.num_steps={log_lines(run)[-1]['step'] + 2}"
-        more = run_script("train", "out_dir=run", "resume=true", *named, steps, cwd=tmp_path)
+    assert all(low < high for low, high in zip(*box))
+    places = [config["sampler"]["grid"], config["field"], config["renderer"]["sampler"]["grid"]]
+    assert all(place["box"] == box for place in [*places, config["renderer"]["field"]["deformation"]])
+    shutil.copytree(whole, tmp_path / "run")
+    for number, named in enumerate(((), ("data.box=auto",), (*SETTINGS, "data.box=auto")), STEPS + 1):
+        more = run_script("train", "out_dir=run", "resume=true", *named, f"trainer.num_steps={number}", cwd=tmp_path)
         assert more.returncode == 0, more.stderr
-        assert "beginning anew" not in more.stdout
-        assert yaml.safe_load((run / "config.yaml").read_text())["data"]["box"] == box
-    assert [line["step"] for line in log_lines(run)] == list(range(1, 11))
-    other = train(tmp_path, "data.box=[[-5,-5,-5],[5,5,5]]", "resume=true", "trainer.num_steps=12")
+        assert more.stdout.count("box: ") == 1
+        assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["data"]["box"] == box
+    assert [line["step"] for line in log_lines(tmp_path / "run")] == list(range(1, STEPS + 4))
+    other = train(tmp_path, "data.box=[[-2,-2,-2],[2,2,2]]", "resume=true")
     assert other.returncode == 2
-    assert "box" in other.stderr
+    assert "data.box must be" in other.stderr
 
 
-def test_checkpoints_of_the_box_that_was_too_large_are_gone(tmp_path: Path) -> None:
-    """What has been trained until matter is found does not fit the smaller model, which `resume=true` would read."""
-    changes = (
-        "trainer.num_steps=12", "trainer.checkpoint_every=2", "trainer.box_check.every=4", "sampler.resolution=64",
-        "trainer.box_check.room=0", "trainer.box_check.shrink_below=0.99",
-        "data.box=[[-3.25,-3.25,-3.25],[3.25,3.25,3.25]]",
-    )  # fmt: skip
-    # What views reach is taken at once, the 0.97 of it that they see well only later on.
-    done = train(tmp_path, *changes, "resume=true")
+def test_a_box_of_ones_own_is_taken_as_given(tmp_path: Path) -> None:
+    done = train(tmp_path, "data.box=[[-2,-2,-2],[2,2,2]]", "trainer.num_steps=2")
     assert done.returncode == 0, done.stderr
-    assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["box_fit"]["seconds"] > 0
-    assert [line["step"] for line in log_lines(tmp_path / "run")] == list(range(1, 13))
-    again = train(tmp_path, *changes, "resume=true")
-    assert again.returncode == 0, again.stderr
-    assert "nothing to do" in again.stdout
+    assert "box: [[-2, -2, -2], [2, 2, 2]], as given" in done.stdout
+
+
+def test_a_finished_run_that_goes_on_is_not_thrown_back(tmp_path: Path, whole: Path) -> None:
+    """Rates stay where they ended, and all frames and grid levels stay in, however far the new end is."""
+    shutil.copytree(whole, tmp_path / "run")
+    last = log_lines(whole)[-1]["learning_rate_factor"]
+    assert last < 0.08
+    more = run_script("train", "out_dir=run", "resume=true", f"trainer.num_steps={4 * STEPS}", cwd=tmp_path)
+    assert more.returncode == 0, more.stderr
+    assert all(line["learning_rate_factor"] <= last for line in log_lines(tmp_path / "run")[STEPS:])
+    checkpoint = next((tmp_path / "run" / "checkpoints").glob(f"step_*{4 * STEPS}.safetensors"))
+    tensors, facts = decode(checkpoint.read_bytes())
+    assert facts is not None
+    assert facts["progress"] >= 1 - 1 / STEPS
+    assert bool((tensors["renderer.field.canonical.window"] == 1).all())
 
 
 def test_a_stopped_run_ends_with_the_weights_of_an_uninterrupted_one(tmp_path: Path, whole: Path) -> None:
@@ -157,7 +154,7 @@ def test_a_run_that_never_began_begins(tmp_path: Path, whole: Path, made: bool) 
 
 
 def test_a_start_that_was_refused_is_in_nobodys_way(tmp_path: Path, whole: Path) -> None:
-    """Pictures without alpha want one colour behind them; what was written before that was known is no run."""
+    """Images without alpha want one colour behind them; what was written before that was known is no run."""
     refused = run_script("train", *SETTINGS, "+data.background=white", "background=random", "out_dir=run", cwd=tmp_path)
     assert refused.returncode == 2
     assert "background: a random one needs frames with alpha" in refused.stderr
@@ -198,7 +195,7 @@ def test_a_model_without_checkpoints_is_not_trained_over(tmp_path: Path, whole: 
         (("evaluate_frames=0",), "evaluate_frames must be a whole number of at least 1 or null, got 0"),
         (("chunk=1.5",), "chunk must be a whole number of at least 1, got 1.5"),
         (("data.box=[[10,10,10],[11,11,11]]",), "box must be seen by some camera between near 2 and far 6"),
-        (("trainer.betas=[0.9,2]",), "betas must be two numbers in [0, 1)"),
+        (("trainer.optimizer.betas=[0.9,2]",), "trainer.optimizer.betas must be two numbers in [0, 1)"),
         (("data_root=elsewhere", "resume=true"), "data_root must be null, this run's frames are of an exact scene"),
         (("data_root=elsewhere",), "data_root must be null unless a run is continued"),
     ],
@@ -266,7 +263,7 @@ def test_a_run_in_use_is_refused_and_lives_on(tmp_path: Path) -> None:
 
 def test_seconds_spent_are_part_of_the_state(tmp_path: Path) -> None:
     # Rates that fall from the first step on: the schedule alone says how much time is spent.
-    falling = ("trainer.time_window=null", "trainer.warmup_steps=0")
+    falling = ("trainer.optimizer.hold_until=0", "trainer.optimizer.warmup_steps=0")
     limited = (*SETTINGS, *falling, "trainer.num_steps=1000000", "trainer.max_seconds=3", "out_dir=run")
     first = Run("train", *limited, cwd=tmp_path)
     wait_for_step(tmp_path / "run", 9)
@@ -293,8 +290,8 @@ def test_other_frames_than_those_the_run_began_with_are_refused(tmp_path: Path) 
             f"seed={seed}", f"out=data{seed}", cwd=tmp_path,
         )  # fmt: skip
         assert made.returncode == 0, made.stderr
-    blender = ("data=blender", "data.resolution=16", "trainer.num_steps=2", "trainer.progress_bar=false")
-    common = ("experiment=fast", *blender, "sampler.resolution=16", "out_dir=run")
+    blender = ("data=blender", "data.resolution=16", "trainer.num_steps=2", "~trainer.callbacks.progress_bar")
+    common = ("experiment=fast", *blender, "sampler.grid.resolution=16", "out_dir=run")
     assert run_script("train", *common, "data.root=data0", cwd=tmp_path).returncode == 0
     (tmp_path / "data0").rename(tmp_path / "moved")
     again = (*common, "resume=true")

@@ -21,15 +21,15 @@ from omegaconf.errors import OmegaConfBaseException
 from test_scripts import TINY
 
 from dnerf.data import load_blender
-from dnerf.metrics import psnr
-from dnerf.protocols import PROTOCOLS, Protocol
+from dnerf.evaluation import psnr
+from dnerf.evaluation.protocols import PROTOCOLS, Protocol
 
 KEYS = {"keyframes": [{"seconds": 0, "time": 0.1, "azimuth": 0}, {"seconds": 0.5, "time": 0.6, "azimuth": 40}]}
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory):
-    """A folder with a run of a blender scene called lego, 16 x 16 pictures with alpha."""
+    """A folder with a run of a blender scene called lego, 24 x 24 images with alpha."""
     cwd = tmp_path_factory.mktemp("sequences")
     made = run_script(
         "make_dataset", "scene=walker", "num_frames=3", "num_val=1", "num_test=2", "resolution=24", "out=data/lego",
@@ -38,7 +38,7 @@ def work(tmp_path_factory):
     assert made.returncode == 0, made.stderr
     done = run_script(
         "train", "experiment=fast", "data=blender", "data.root=data/lego", "data.resolution=24", *TINY[4:],
-        "out_dir=run", "seed=3", cwd=cwd,
+        "++field.density_shift=2.0", "out_dir=run", "seed=3", cwd=cwd,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return cwd
@@ -146,6 +146,41 @@ def test_outputs_and_slow_motion(work):
         assert arrays["deformation"].shape == (5, 24, 24)
 
 
+@pytest.mark.parametrize("path", ["orbit", "spiral", "fixed", "keyframes", "test"])
+def test_every_path_takes_its_camera_from_the_split_that_there_is(work, path, capsys):
+    (work / "keys.json").write_text(json.dumps(KEYS))
+    shutil.copytree(work / "data", work / "bare")
+    for split in ("test", "val"):
+        (work / "bare" / "lego" / f"transforms_{split}.json").unlink()
+    file = ("path.file=keys.json",) if path == "keyframes" else ()
+    arguments = ("run=run", f"path={path}", "data_root=bare/lego", "num_frames=1", "fps=2", "format=npz", *file)
+    try:
+        call("render", *arguments, "path.split=train", "output=bare/named")
+        call("render", *arguments, "path.split=null", "output=bare/film")
+        assert "the camera is that of the train split: " in capsys.readouterr().out
+        films = [np.load(work / "bare" / f"{name}.npz") for name in ("named", "film")]
+        np.testing.assert_array_equal(films[0]["poses"], films[1]["poses"])
+        with pytest.raises(ValueError, match="transforms_test"):
+            call("render", *arguments, "path.split=test", "output=bare/none")
+    finally:
+        shutil.rmtree(work / "bare")
+
+
+def test_an_empty_film_is_noticed(work, capsys):
+    call("render", "run=run", "path.radius=8", "num_frames=1", "format=png", "output=far/film")
+    assert "warning" not in capsys.readouterr().err
+    call("render", "run=run", "path.target=[0,0,99]", "num_frames=1", "format=png", "output=far/empty")
+    assert "warning: the film is empty" in (said := capsys.readouterr().err)
+    assert "path.radius=4.0, path.target=[0, 0, 99]" in said
+
+
+def test_consistency_is_checked_and_written(work, capsys):
+    call("evaluate", "run=run", "worst=0", "plots=false", "consistency=true")
+    checks = json.loads((work / "run" / "consistency.json").read_text())["checks"]
+    assert [check["check"] for check in checks] == ["time continuity", "no popping", "colour along tracks"]
+    assert all(check["check"] in capsys.readouterr().out for check in checks[:1])
+
+
 def test_truth_stands_beside_the_prediction(work):
     call(
         "render",
@@ -190,9 +225,11 @@ def test_evaluation_by_protocol_says_everything_and_makes_tables(work):
 
 def test_a_film_can_be_rendered_in_longer_steps(work):
     films = []
-    for splits in (1, 4):
-        output = f"films/splits{splits}"
-        call("render", "run=run", "path=fixed", "num_frames=2", "format=npz", f"splits={splits}", f"output={output}")
+    for parts in (1, 4):
+        output = f"films/parts{parts}"
+        call(
+            "render", "run=run", "path=fixed", "num_frames=2", "format=npz", f"subdivision={parts}", f"output={output}"
+        )
         films.append(np.load(work / f"{output}.npz")["rgb"].astype(float))
     difference = np.abs(films[0] - films[1])
     assert difference.max() > 0
@@ -216,7 +253,7 @@ def test_a_protocol_sets_resolution_background_and_split(work, monkeypatch):
         assert scored["psnr"] == pytest.approx(psnr(on_black, frames.image(index, (0.0, 0.0, 0.0))), abs=1e-3)
 
 
-def test_pictures_are_never_enlarged_to_fit_a_protocol(work):
+def test_images_are_never_enlarged_to_fit_a_protocol(work):
     with pytest.raises(ValueError, match="800"):
         call("evaluate", "run=run", "protocol=gs")
 
@@ -233,9 +270,10 @@ def test_report_is_made_from_what_lies_in_the_run(work):
 
 
 WRONG = [
-    ("render", ("run=run", "exact=maybe"), "exact must be true or false, got 'maybe'"),
-    ("render", ("run=run", "splits=0"), "splits must be a whole number of at least 1 or null, got 0"),
-    ("render", ("run=run", "splits=1.5"), "splits must be a whole number of at least 1 or null, got 1.5"),
+    ("render", ("run=run", "keep_frames=maybe"), "keep_frames must be true or false, got 'maybe'"),
+    ("render", ("run=run", "subdivision=0"), "subdivision must be a whole number of at least 1 or null, got 0"),
+    ("render", ("run=run", "subdivision=1.5"), "subdivision must be a whole number of at least 1 or null, got 1.5"),
+    ("render", ("run=run", "path.split=all"), "path.split must be one of train, val, test or null, got 'all'"),
     ("render", ("run=run", "chunk=0"), "chunk must be a whole number of at least 1 or null, got 0"),
     ("render", ("run=run", "num_frames=true"), "num_frames must be a whole number of at least 1, got True"),
     ("render", ("run=run", "format=[]"), "format must be a text or a list of them"),
@@ -256,7 +294,8 @@ WRONG = [
     ("evaluate", ("run=run", "lego_split=other"), "lego_split"),
     ("evaluate", ("run=run", "runs=[run]"), "run"),
     ("evaluate", ("runs=run",), "runs must be a list of texts, got 'run'"),
-    ("evaluate", ("run=run", "temporal.num_frames=1"), "temporal.num_frames must be a whole number of at least 2"),
+    ("evaluate", ("run=run", "temporal.num_frames=2"), "temporal.num_frames must be a whole number of at least 3"),
+    ("evaluate", ("run=run", "consistency=1"), "consistency must be true or false, got 1"),
     ("tracks", ("run=run", "every=1.5"), "every must be a whole number of at least 1, got 1.5"),
     ("tracks", ("run=run", "output=x.gif"), "must be a file that ends in .mp4, got x.gif"),
     ("tracks", ("run=run", "format=gif", "fps=1000"), "fps must be at most 50 for gif"),
@@ -314,7 +353,7 @@ def test_a_split_that_cannot_be_scored_is_found_before_training(work):
     assert not (work / "never").exists()
 
 
-def test_a_picture_that_no_memory_holds_is_an_error_in_one_line(work):
+def test_an_image_that_no_memory_holds_is_an_error_in_one_line(work):
     done = run_script("render", "run=run", "path=fixed", "num_frames=1", "resolution=3000000", cwd=work)
     assert done.returncode == 2
     assert "can't allocate memory" in done.stderr

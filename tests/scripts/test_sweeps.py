@@ -20,12 +20,12 @@ SETTINGS = (
     "trainer.num_rays=32",
     "trainer.target_samples=1024",
     "trainer.log_every=1",
-    "trainer.checkpoint_every=5",
-    "trainer.progress_bar=false",
+    "trainer.callbacks.checkpoints.every=5",
+    "~trainer.callbacks.progress_bar",
     "field.resolutions=[8,16]",
-    "sampler.resolution=16",
-    "sampler.num_slabs=4",
-    "sampler.num_probes=1024",
+    "sampler.grid.resolution=16",
+    "sampler.grid.num_slabs=4",
+    "+sampler.grid.num_probes=1024",
     "out_dir=sweep",
 )
 
@@ -41,57 +41,57 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def half_failed(tmp_path_factory: pytest.TempPathFactory):
-    """A sweep of 2 x 2 runs, of which those with too many probes' worth of cells fail while they are built."""
+    """A sweep of 2 x 2 runs, of which those whose window ends too late fail while they are built."""
     cwd = tmp_path_factory.mktemp("sweep")
-    return cwd, sweep(cwd, "field.max_rows=1000,4096", "seed=0,1")
+    return cwd, sweep(cwd, "field.window_end=2,0.5", "seed=0,1")
 
 
 def test_a_failed_job_leaves_the_others_alone(half_failed) -> None:
     cwd, done = half_failed
     assert done.returncode == 2, done.stderr
     assert sorted(p.parent.name for p in (cwd / "sweep").glob("*/metrics.json")) == [
-        "field.max_rows-4096_seed-0",
-        "field.max_rows-4096_seed-1",
+        "field.window_end-0.5_seed-0",
+        "field.window_end-0.5_seed-1",
     ]
     lines = done.stderr.strip().splitlines()
     assert len(lines) == 3, done.stderr
     assert all(line.startswith("error: ") for line in lines)
-    assert "max_rows must be a power of two" in lines[0]
-    assert "2 of the sweep's jobs failed: field.max_rows-1000_seed-0; field.max_rows-1000_seed-1" in lines[2]
+    assert "renderer.field.canonical.window_end must be in (0, 1]" in lines[0]
+    assert "2 of the sweep's jobs failed: field.window_end-2_seed-0; field.window_end-2_seed-1" in lines[2]
 
 
 def test_a_sweep_ends_in_one_table(half_failed) -> None:
     cwd, done = half_failed
     found = rows(cwd / "sweep")
     assert [(row["run"], row["status"]) for row in found] == [
-        ("field.max_rows-1000_seed-0", "failed"),
-        ("field.max_rows-1000_seed-1", "failed"),
-        ("field.max_rows-4096_seed-0", "done"),
-        ("field.max_rows-4096_seed-1", "done"),
+        ("field.window_end-0.5_seed-0", "done"),
+        ("field.window_end-0.5_seed-1", "done"),
+        ("field.window_end-2_seed-0", "failed"),
+        ("field.window_end-2_seed-1", "failed"),
     ]
-    assert all(float(row["psnr"]) > 0 for row in found[2:])
+    assert all(float(row["psnr"]) > 0 for row in found[:2])
     assert "seed" in done.stdout
     assert "sd" in done.stdout  # the mean over seeds
-    reason = (cwd / "sweep" / "errors" / "field.max_rows-1000_seed-1.txt").read_text()
+    reason = (cwd / "sweep" / "errors" / "field.window_end-2_seed-1.txt").read_text()
     assert "Traceback" in reason
-    assert "power of two" in reason
+    assert "window_end must be in" in reason
 
 
 def test_a_finished_sweep_is_continued_without_running_anything_again(half_failed) -> None:
     cwd, _ = half_failed
-    before = {path: path.read_bytes() for path in (cwd / "sweep").glob("*-4096*/*") if path.is_file()}
+    before = {path: path.read_bytes() for path in (cwd / "sweep").glob("*-0.5*/*") if path.is_file()}
     assert before
-    done = sweep(cwd, "field.max_rows=4096", "seed=0,1,2", "resume=true")
+    done = sweep(cwd, "field.window_end=0.5", "seed=0,1,2", "resume=true")
     assert done.returncode == 0, done.stderr
     # Named by what this sweep varies: other folders, new runs.
     assert {p.parent.name for p in (cwd / "sweep").glob("*/metrics.json")} >= {"seed-0", "seed-1", "seed-2"}
-    done = sweep(cwd, "field.max_rows=2048,4096", "seed=0,1", "resume=true")
+    done = sweep(cwd, "field.window_end=0.25,0.5", "seed=0,1", "resume=true")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("nothing to do") == 2
-    assert {path: path.read_bytes() for path in (cwd / "sweep").glob("*-4096*/*") if path.is_file()} == before
+    assert {path: path.read_bytes() for path in (cwd / "sweep").glob("*-0.5*/*") if path.is_file()} == before
     # A single one, alone.
     done = run_script(
-        "train", *SETTINGS[:-1], "out_dir=sweep/field.max_rows-4096_seed-1", "resume=true", "field.max_rows=4096",
+        "train", *SETTINGS[:-1], "out_dir=sweep/field.window_end-0.5_seed-1", "resume=true", "field.window_end=0.5",
         "seed=1", "trainer.num_steps=4", cwd=cwd,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -177,16 +177,16 @@ def test_submitit_runs_each_job_in_its_own_process(tmp_path: Path) -> None:
         "hydra/launcher=submitit_local",
         "hydra.launcher.timeout_min=5",
         "seed=0,1",
-        "field.max_rows=1000,4096",
+        "field.window_end=2,0.5",
     )
     done = sweep(tmp_path, *arguments)
     assert done.returncode == 2, done.stderr
     found = {row["run"]: row["status"] for row in rows(tmp_path / "sweep")}
     assert found == {
-        "field.max_rows-1000_seed-0": "failed",
-        "field.max_rows-4096_seed-0": "done",
-        "field.max_rows-1000_seed-1": "failed",
-        "field.max_rows-4096_seed-1": "done",
+        "field.window_end-2_seed-0": "failed",
+        "field.window_end-0.5_seed-0": "done",
+        "field.window_end-2_seed-1": "failed",
+        "field.window_end-0.5_seed-1": "done",
     }
     assert "2 of the sweep's jobs failed" in done.stderr
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dnerf.compositing import FieldOutput, Rendering, composite
-from dnerf.rays import Samples
+from dnerf.core.compositing import FieldOutput, Rendering, composite
+from dnerf.core.rays import Samples
 
 
 def random_depths(num_rays: int, num_samples: int, seed: int) -> Tensor:
@@ -28,7 +28,7 @@ def unit_samples(num_rays: int, num_samples: int, dtype: torch.dtype = torch.flo
     return Samples(starts, starts + 1 / 128, num_rays)
 
 
-def picture(depths: Tensor, rgb: Tensor, background: Tensor, packed: bool, **options: object) -> Rendering:
+def image(depths: Tensor, rgb: Tensor, background: Tensor, packed: bool, **options: object) -> Rendering:
     """Composite optical depths (R, S)."""
     num_rays, num_samples = depths.shape
     samples = unit_samples(num_rays, num_samples, depths.dtype)

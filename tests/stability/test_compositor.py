@@ -4,13 +4,13 @@ import math
 
 import pytest
 import torch
-from cases import picture, random_depths, relative, unit_samples, value_and_gradients
+from cases import image, random_depths, relative, unit_samples, value_and_gradients
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dnerf.compositing import FieldOutput, composite
-from dnerf.quadrature import RULES
-from dnerf.rays import Samples
+from dnerf.core.compositing import FieldOutput, composite
+from dnerf.core.quadrature import RULES
+from dnerf.core.rays import Samples
 
 BOUND = 1e-6
 """Relative error that the project promises of colour, opacity and depth in float32."""
@@ -26,15 +26,15 @@ def batch(num_rays: int, num_samples: int, seed: int) -> tuple[torch.Tensor, ...
 
 @layouts
 @pytest.mark.parametrize(("num_rays", "num_samples"), [(12000, 1), (12000, 24), (1500, 256), (90, 4096)])
-def test_float32_pictures_are_exact_to_1e_6(packed: bool, num_rays: int, num_samples: int) -> None:
+def test_float32_images_are_exact_to_1e_6(packed: bool, num_rays: int, num_samples: int) -> None:
     depths, rgb, background = batch(num_rays, num_samples, num_samples)
     dark = torch.zeros(3)
-    rounded, exact = picture(depths, rgb, dark, packed), picture(depths.double(), rgb.double(), dark.double(), packed)
+    rounded, exact = image(depths, rgb, dark, packed), image(depths.double(), rgb.double(), dark.double(), packed)
     for name in ("rgb", "opacity", "depth"):
         assert relative(getattr(rounded, name), getattr(exact, name)).max() < BOUND, name
     # What is left of the background behind an opaque ray, 1 - opacity, is known to the rounding of 1.
-    behind = picture(depths, rgb, background, packed).rgb.double()
-    truth = picture(depths.double(), rgb.double(), background.double(), packed).rgb
+    behind = image(depths, rgb, background, packed).rgb.double()
+    truth = image(depths.double(), rgb.double(), background.double(), packed).rgb
     assert (behind - truth).abs().max() < BOUND
 
 
@@ -44,7 +44,7 @@ def test_float32_gradients_are_exact_to_rounding(packed: bool, num_rays: int, nu
     depths, rgb, background = batch(num_rays, num_samples, 7 * num_samples)
 
     def color(*inputs: torch.Tensor) -> torch.Tensor:
-        return picture(*inputs, packed).rgb
+        return image(*inputs, packed).rgb
 
     _, rounded = value_and_gradients(color, depths, rgb, background)
     _, exact = value_and_gradients(color, *(x.double() for x in (depths, rgb, background)))
@@ -60,7 +60,7 @@ def test_gradients_of_thin_rays_are_relative_to_their_size(packed: bool) -> None
     rgb, background = torch.rand(6000, 16, 3), torch.rand(6000, 3)
 
     def opacity(depth: torch.Tensor) -> torch.Tensor:
-        return picture(depth, rgb.to(depth.dtype), background.to(depth.dtype), packed).opacity
+        return image(depth, rgb.to(depth.dtype), background.to(depth.dtype), packed).opacity
 
     _, (rounded,) = value_and_gradients(opacity, depths)
     _, (exact,) = value_and_gradients(opacity, depths.double())
@@ -113,7 +113,7 @@ def test_wall_at_the_first_sample_hides_everything_and_lets_no_gradient_through(
     rgb = torch.rand(50, 8, 3)
 
     def color(d: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
-        return picture(d, c, torch.ones(3), packed).rgb
+        return image(d, c, torch.ones(3), packed).rgb
 
     value, (to_depth, to_rgb) = value_and_gradients(color, depths, rgb)
     left = math.exp(-depth)
@@ -128,34 +128,12 @@ def test_four_thousand_thin_samples_add_up_in_value_and_gradient(packed: bool) -
     depths = torch.full((3, 4096), 1e-4)
 
     def opacity(d: torch.Tensor) -> torch.Tensor:
-        return picture(d, torch.ones(3, 4096, 3), torch.zeros(3), packed).opacity
+        return image(d, torch.ones(3, 4096, 3), torch.zeros(3), packed).opacity
 
     value, (gradient,) = value_and_gradients(opacity, depths)
     total = 4096 * float(torch.tensor(1e-4))  # the float32 nearest to 1e-4
     assert relative(value, torch.tensor(-math.expm1(-total))).max() < BOUND
     assert relative(gradient, torch.tensor(math.exp(-total))).max() < BOUND
-
-
-@layouts
-def test_bfloat16_fields_are_composited_as_float32(packed: bool) -> None:
-    depths, rgb, background = batch(900, 24, 3)
-    half = depths.bfloat16(), rgb.bfloat16()
-    rounded = picture(*half, background, packed)
-    exact = picture(*(x.double() for x in half), background.double(), packed)
-    assert rounded.rgb.dtype == torch.float32
-    # 128 times a bfloat16 is one, and so is the product with the length: no rounding but the compositor's own.
-    assert relative(rounded.opacity, exact.opacity).max() < BOUND
-
-
-def test_one_sample_near_equal_far_and_no_sample_show_the_background() -> None:
-    background = torch.rand(4, 3)
-    ones, nothing = torch.ones(4, 1), torch.zeros(0)
-    point = composite(Samples(ones, ones, 4), FieldOutput(1e30 * ones, torch.ones(4, 1, 3)), background)
-    empty = Samples(nothing, nothing, 4, ray_indices=nothing.long())
-    none = composite(empty, FieldOutput(nothing, torch.zeros(0, 3)), background)
-    for rendering in (point, none):
-        assert torch.equal(rendering.rgb, background)
-        assert (rendering.depth == 0).all()
 
 
 def test_rays_of_very_different_depth_do_not_disturb_each_other_when_packed() -> None:

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from dnerf.benchmarks.closed_flows import ClosedFlow, Expansion, Rotation, Shear, Swirl
+from benchmarks.closed_flows import ClosedFlow, Expansion, Rotation, Shear, Swirl
 from dnerf.deformations import FlowDeformation
-from dnerf.deformations.velocities import CurlVelocity, GridVelocity, NetworkVelocity, RigidVelocity, Velocity
+from dnerf.deformations.velocities import CurlVelocity, NetworkVelocity, RigidVelocity, Velocity
 
 BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
 TURN = 6.283185307179586
@@ -29,7 +29,6 @@ HARD: dict[str, tuple[ClosedFlow, int, float, float]] = {
 
 VELOCITIES = {
     "network": lambda: NetworkVelocity(BOX, 3, 32),
-    "grid": lambda: GridVelocity(BOX),
     "curl": lambda: CurlVelocity(BOX),
     "rigid": lambda: RigidVelocity(BOX),
 }
@@ -99,21 +98,6 @@ def test_trainable_flows_in_float32_agree_with_float64(name: str) -> None:
     # Slopes jump where a cell or a ReLU ends: nearly all agree, none is wild.
     assert (gradient.double() - exact_gradient).abs().quantile(0.98) < 1e-3
     assert torch.isfinite(gradient).all()
-
-
-@pytest.mark.parametrize("name", VELOCITIES)
-def test_flows_under_bfloat16_autocast_stay_close_to_float32(name: str) -> None:
-    flow = FlowDeformation(moving(name), 0.5, solver="midpoint", num_steps=2)
-    positions, times = points()
-    exact, (truth,) = value_and_gradients(lambda x: flow(x, times), positions)
-    with torch.autocast("cpu", torch.bfloat16):
-        rounded, (gradient,) = value_and_gradients(lambda x: flow(x, times), positions)
-    assert rounded.dtype == torch.float32
-    moved = (exact - positions).norm(dim=-1).max()
-    # bfloat16 keeps 8 bits, 4e-3 a product; positions themselves are float32, so the error is of the motion alone.
-    assert (rounded - exact).norm(dim=-1).max() < 0.05 * moved
-    assert torch.isfinite(gradient).all()
-    assert (gradient - truth).abs().mean() < 0.1 * max(1.0, float(truth.abs().mean()))
 
 
 @pytest.mark.parametrize("name", VELOCITIES)

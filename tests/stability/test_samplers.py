@@ -4,12 +4,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from reference import occupancy_sampler
 
-from dnerf.compositing import FieldOutput, composite
+from dnerf.core.compositing import FieldOutput, composite
+from dnerf.core.rays import Rays
 from dnerf.fields.base import RadianceField
 from dnerf.kernels import use_backend
-from dnerf.rays import Rays
-from dnerf.samplers import ImportanceSampler, OccupancySampler, StratifiedSampler
+from dnerf.samplers import ImportanceSampler, StratifiedSampler
 from dnerf.samplers.inverse_cdf import sample_piecewise_constant
 
 BOX = ((-1.0, -0.5, -1.5), (1.0, 0.5, 1.5))
@@ -17,7 +18,7 @@ SAMPLERS = {
     "stratified": lambda: StratifiedSampler(16, BOX),
     "one sample": lambda: StratifiedSampler(1, BOX),
     "importance": lambda: ImportanceSampler(12, 12, box=BOX),
-    "occupancy": lambda: OccupancySampler(BOX, 0.05, 16, num_slabs=2),
+    "occupancy": lambda: occupancy_sampler(BOX, 0.05, 16, num_slabs=2),
 }
 
 
@@ -57,7 +58,7 @@ def hard_rays(seed: int, count: int = 3000) -> Rays:
 @pytest.mark.parametrize("name", SAMPLERS)
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize("seed", range(3))
-def test_hard_rays_give_finite_ordered_intervals_and_finite_pictures(name: str, training: bool, seed: int) -> None:
+def test_hard_rays_give_finite_ordered_intervals_and_finite_images(name: str, training: bool, seed: int) -> None:
     sampler, rays, field = SAMPLERS[name]().train(training), hard_rays(seed), Fog()
     samples = sampler(rays, field, generator=torch.Generator().manual_seed(seed))
     assert torch.isfinite(samples.starts).all()
@@ -119,8 +120,8 @@ def cumulative(edges: torch.Tensor, weights: torch.Tensor, positions: torch.Tens
 
 
 def test_an_empty_packed_batch_is_rendered_and_differentiated() -> None:
-    sampler = OccupancySampler(BOX, 0.05, 16, num_slabs=2)
-    sampler.occupy(torch.tensor(False))
+    sampler = occupancy_sampler(BOX, 0.05, 16, num_slabs=2)
+    sampler.grid.occupy(torch.tensor(False))
     rays = hard_rays(5, 60)
     density = torch.zeros(0, requires_grad=True)
     samples = sampler(rays, Fog())

@@ -4,12 +4,13 @@ import math
 
 import pytest
 import torch
+from reference import occupancy_sampler
 
-from dnerf.compositing import composite
+from dnerf.core.compositing import composite
+from dnerf.core.rays import Rays
 from dnerf.data import render_exact
-from dnerf.rays import Rays
-from dnerf.renderer import Renderer
-from dnerf.samplers import OccupancySampler, StratifiedSampler
+from dnerf.rendering.renderer import Renderer
+from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import AnalyticScene, Ball, Body, Box, Fixed, Plain, make_scene
 
 HARD = [
@@ -28,7 +29,7 @@ def camera_rays(count: int, seed: int = 0) -> Rays:
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_pictures_without_knowledge_are_finite_and_alike_in_float32_and_float64(name: str) -> None:
+def test_images_without_knowledge_are_finite_and_alike_in_float32_and_float64(name: str) -> None:
     scene, rays = make_scene(name), camera_rays(600)
     sampler = StratifiedSampler(128, scene.box).eval()
     rounded, exact = (
@@ -45,11 +46,11 @@ def test_pictures_without_knowledge_are_finite_and_alike_in_float32_and_float64(
 def test_occupancy_loses_none_of_a_scene(name: str) -> None:
     scene, rays = make_scene(name), camera_rays(400, 1)
     box = (1.3 * scene.box).tolist()
-    sampler = OccupancySampler(box, 0.02, 32, num_slabs=16, threshold=0.01, pad_to=1).eval()
+    sampler = occupancy_sampler(box, 0.02, 32, num_slabs=16, threshold=0.01, pad_to=1).eval()
     everywhere = Renderer(scene, sampler).eval()
     full = everywhere(rays).rgb
-    sampler.fill(scene, 4)
-    assert (~sampler.occupied).any()
+    sampler.grid.fill(scene, 4)
+    assert (~sampler.grid.occupied).any()
     guided = everywhere(rays).rgb
     if name == "thin_rod":
         # Random probes cannot find a rod that fills 1e-4 of a cell: only the hub is certain to stay.

@@ -1,27 +1,32 @@
-"""The training loop: spikes, not-a-numbers, collapse, empty pictures, bfloat16, hard scenes."""
+"""The training loop: spikes, not-a-numbers, collapse, empty images, bfloat16, hard scenes."""
 
-import copy
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
+from reference import occupancy_sampler
 
-from dnerf.backgrounds import RandomBackground
-from dnerf.data import render_frames
+from dnerf.core.backgrounds import RandomBackground
+from dnerf.data import Frames, render_frames
 from dnerf.data.synthetic import random_views
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, GridField
-from dnerf.recovery import Recovery
-from dnerf.renderer import Renderer
-from dnerf.samplers import OccupancySampler, StratifiedSampler
+from dnerf.rendering.renderer import Renderer
+from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
-from dnerf.training import Trainer
+from dnerf.training.callbacks import Callback
+from dnerf.training.optimizer import AdamSettings
+from dnerf.training.records import TrainingRecord
+from dnerf.training.recovery import Recovery
+from dnerf.training.run import Run
+from dnerf.training.trainer import Trainer
 
 BOX = [[-1.5] * 3, [1.5] * 3]
-LEARNING_RATES = {"": 1e-2, "field.deformation": 1e-3}
 
 
-def frames_of(name: str, resolution: int = 16, count: int = 4):
+def frames_of(name: str, resolution: int = 16, count: int = 4) -> Frames:
     return render_frames(make_scene(name), *random_views(count), resolution)
 
 
@@ -29,118 +34,115 @@ def small_renderer(precision: str = "float32", occupancy: bool = False) -> Rende
     torch.manual_seed(0)
     deformation = DisplacementDeformation(2, 16, (), position_frequencies=2, time_frequencies=3)
     field = DeformedField(deformation, GridField(BOX, (8, 16), 8, hidden_features=16, num_layers=1))
-    sampler = OccupancySampler(BOX, 0.1, 16, num_slabs=4) if occupancy else StratifiedSampler(24, BOX)
+    sampler = occupancy_sampler(BOX, 0.1, 16, num_slabs=4) if occupancy else StratifiedSampler(24, BOX)
     return Renderer(field, sampler, RandomBackground(), precision=precision)
 
 
-def trainer(**options) -> Trainer:
-    defaults = {
-        "num_steps": 60, "num_rays": 64, "log_every": 5, "progress_bar": False, "learning_rates": LEARNING_RATES,
-        "recovery": Recovery(keep_every=5, patience=3),
-    }  # fmt: skip
-    return Trainer(**{**defaults, **options})
+class Watch(Callback):
+    """Keeps the records that stand, and changes the model once."""
+
+    def __init__(self, at: int = -1, change: Callable[[Renderer], None] | None = None) -> None:
+        self.at = at
+        self.change = change
+        self.records: list[TrainingRecord] = []
+
+    def on_step_end(self, run: Run) -> None:
+        if run.record is not None:
+            self.records.append(run.record)
+        if run.step == self.at:
+            self.change(run.renderer)
+
+
+def train(
+    renderer: Renderer, frames: Frames, *, num_steps: int = 60, watch: Watch | None = None,
+    recovery: Recovery | None = None, rates: dict[str, float] | None = None,
+) -> TrainingRecord:  # fmt: skip
+    trainer = Trainer(
+        num_steps=num_steps, num_rays=64, log_every=5,
+        optimizer=AdamSettings(rates or {"default": 1e-2, "deformation": 1e-3, "deformation_output": 1e-3}),
+        callbacks={"recovery": recovery, "watch": watch},
+    )  # fmt: skip
+    return trainer.fit(renderer, frames)
+
+
+def watchful() -> Recovery:
+    return Recovery(keep_every=5, patience=3)
 
 
 @pytest.fixture(scope="module")
-def frames():
+def frames() -> Frames:
     return frames_of("static")
 
 
-@torch.no_grad()
-def break_once(at: int, change):
-    """A callback that spoils the model once."""
-    steps = []
-
-    def callback(record, renderer):
-        steps.append(record.step)
-        if record.step == at:
-            change(renderer)
-
-    return callback, steps
-
-
-def to_nan(renderer):
+def to_nan(renderer: Renderer) -> None:
     renderer.field.deformation.mlp.output.weight.data[0, 0] = math.nan
 
 
-def explode(renderer):
+def explode(renderer: Renderer) -> None:
     for parameter in renderer.parameters():
         parameter.data.mul_(1e25)
 
 
-def empty(renderer):
+def empty(renderer: Renderer) -> None:
     renderer.field.canonical.head.output.weight.data.zero_()
     renderer.field.canonical.head.output.bias.data[0] = -1e4
 
 
 @pytest.mark.parametrize("change", [to_nan, explode, empty], ids=lambda f: f.__name__)
-def test_a_spoilt_run_is_brought_back_and_ends_well(frames, change):
-    renderer, made = small_renderer(), trainer()
-    callback, steps = break_once(30, change)
-    record = made.fit(renderer, frames, callbacks=[callback])
-    (failure,) = made.recovery.failures
+def test_a_spoilt_run_is_brought_back_and_ends_well(frames: Frames, change: Callable[[Renderer], None]) -> None:
+    renderer, recovery, watch = small_renderer(), watchful(), Watch(30, change)
+    record = train(renderer, frames, watch=watch, recovery=recovery)
+    (failure,) = recovery.failures
     # The first record after a NaN, the third after a collapse.
-    assert failure.step == (45 if change is empty else 35)
-    assert failure.step not in steps
+    step = 45 if change is empty else 35
+    assert failure.startswith(f"step {step}: ")
+    assert step not in [record.step for record in watch.records]
     assert record.step == 60
-    assert made.recovery.factor == pytest.approx(0.3)
+    assert recovery.rollbacks == 1
     assert all(torch.isfinite(p).all() for p in renderer.parameters())
     assert record.psnr > 8
     assert renderer.render_image(frames.camera(0), 0.0).opacity.max() > 0.1
 
 
-def test_learning_rate_spikes_end_with_an_error_that_says_what_to_do(frames):
-    made = trainer(learning_rates={"": 1e30})
+def test_learning_rate_spikes_end_with_an_error_that_says_what_to_do(frames: Frames) -> None:
     with pytest.raises(FloatingPointError, match=r"step \d+: .*not finite.*lower its learning rate.*rollbacks"):
-        made.fit(small_renderer(), frames)
+        train(small_renderer(), frames, recovery=watchful(), rates={"default": 1e30})
 
 
-def test_a_healthy_run_is_the_same_with_and_without_a_watch(frames):
+def test_a_healthy_run_is_the_same_with_and_without_a_watch(frames: Frames) -> None:
     plain, watched = small_renderer(), small_renderer()
-    trainer(num_steps=12, recovery=None).fit(plain, frames)
-    trainer(num_steps=12).fit(watched, frames)
+    train(plain, frames, num_steps=12)
+    train(watched, frames, num_steps=12, recovery=watchful())
     for a, b in zip(plain.parameters(), watched.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
-def test_pictures_of_nothing_are_learnt_without_complaint(frames):
-    nothing = copy.copy(frames)
-    object.__setattr__(nothing, "images", torch.zeros_like(frames.images))
-    renderer, made = small_renderer(occupancy=True), trainer(num_steps=60)
-    record = made.fit(renderer, nothing)
-    assert not made.recovery.failures
+def test_images_of_nothing_are_learnt_without_complaint(frames: Frames) -> None:
+    nothing = replace(frames, images=torch.zeros_like(frames.images))
+    renderer, recovery = small_renderer(occupancy=True), watchful()
+    record = train(renderer, nothing, recovery=recovery)
+    assert not recovery.failures
     assert math.isfinite(record.losses["loss"])
     assert record.losses["loss"] < 0.1
     assert all(torch.isfinite(p).all() for p in renderer.parameters())
 
 
-def test_bfloat16_autocast_trains_like_float32(frames):
+def test_bfloat16_autocast_trains_like_float32(frames: Frames) -> None:
     losses = {}
     for precision in ("float32", "bfloat16"):
-        seen: list[float] = []
-        note = lambda record, _, seen=seen: seen.append(record.losses["loss"])  # noqa: E731
-        trainer(num_steps=40, recovery=None).fit(small_renderer(precision), frames, callbacks=[note])
-        losses[precision] = torch.tensor(seen)
+        watch = Watch()
+        train(small_renderer(precision), frames, num_steps=40, watch=watch)
+        losses[precision] = torch.tensor([record.losses["loss"] for record in watch.records])
     # The same rays and points: losses differ by the networks' rounding (4e-3 a product) and what training makes of it.
     assert ((losses["bfloat16"] - losses["float32"]).abs() / losses["float32"]).max() < 0.1
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "thin_rod",
-        "fast_ball",
-        "opaque_wall",
-        "merging_balls",
-        "vanishing_ball",
-        "jumping_ball",
-        "twisting_block",
-        "bouncing_balls",
-        "snowman",
-    ],
-)
-def test_hard_scenes_are_trained_on_without_failure(name):
-    renderer, made = small_renderer("bfloat16", occupancy=True), trainer(num_steps=20)
-    made.fit(renderer, frames_of(name))
-    assert not made.recovery.failures
+@pytest.mark.parametrize("name", [
+    "thin_rod", "fast_ball", "opaque_wall", "merging_balls", "vanishing_ball", "jumping_ball", "twisting_block",
+    "bouncing_balls", "snowman",
+])  # fmt: skip
+def test_hard_scenes_are_trained_on_without_failure(name: str) -> None:
+    renderer, recovery = small_renderer("bfloat16", occupancy=True), watchful()
+    train(renderer, frames_of(name), num_steps=20, recovery=recovery)
+    assert not recovery.failures
     assert all(torch.isfinite(p).all() for p in renderer.parameters())

@@ -1,21 +1,26 @@
 """What a velocity field is, and how it fades to zero at the faces of a box."""
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import as_box, check_positive
+from dnerf.core.checks import as_box, check_positive
+from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup, network_groups
 
 
-class Velocity(nn.Module, ABC):
-    """Velocity of matter in world units per unit of time."""
+class Velocity(nn.Module, DeclaresGroups):
+    """Velocity in world units per unit of time."""
 
     @abstractmethod
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Velocity (..., 3) at positions (..., 3) and times (...,), in the dtype of the positions."""
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """All in "deformation", as of any deformation."""
+        return network_groups(self, "deformation")
 
     def at(self, times: Tensor) -> Callable[[Tensor], Tensor]:
         """The field at fixed times (...,) as a function of positions (..., 3), for several looks at the same times.
@@ -30,26 +35,23 @@ class BoxWindow(nn.Module):
 
     Args:
         box: (2, 3) lowest and highest corner, in world units.
-        margin: width of the fading layer at each face, as a fraction of half the side, in (0, 1].
+        fade: width of the fading layer at each face, as a fraction of half the side, in (0, 1].
         smoothness: number of continuous derivatives, 0 to 4; a solver of order p keeps its order with p.
 
     Raises:
         ValueError: for a box that is none or numbers out of range.
     """
 
-    def __init__(self, box: Sequence[Sequence[float]], margin: float = 0.1, smoothness: int = 4) -> None:
+    def __init__(self, box: Sequence[Sequence[float]], fade: float = 0.1, smoothness: int = 4) -> None:
         super().__init__()
-        check_positive("margin", margin)
-        if margin > 1 or smoothness not in range(5):
-            raise ValueError(f"margin must be in (0, 1] and smoothness in 0..4, got {margin} and {smoothness}")
+        check_positive("fade", fade)
+        if fade > 1 or smoothness not in range(5):
+            raise ValueError(f"fade must be in (0, 1] and smoothness in 0..4, got {fade} and {smoothness}")
         corners = as_box(box)
         self.coefficients = smooth_step_coefficients(smoothness)
-        self.register_buffer("center", corners.mean(0), persistent=False)
-        self.register_buffer("reach", 0.5 * (corners[1] - corners[0]), persistent=False)
-        self.register_buffer("slope", 1 / (margin * self.reach), persistent=False)
-        self.center: Tensor
-        self.reach: Tensor
-        self.slope: Tensor
+        self.center = nn.Buffer(corners.mean(0), persistent=False)
+        self.reach = nn.Buffer(0.5 * (corners[1] - corners[0]), persistent=False)
+        self.slope = nn.Buffer(1 / (fade * self.reach), persistent=False)
 
     def forward(self, positions: Tensor) -> Tensor:
         """Factor (..., 1) at positions (..., 3)."""
@@ -58,7 +60,7 @@ class BoxWindow(nn.Module):
         return x * y * z
 
     def inside(self, positions: Tensor) -> Tensor:
-        """Positions (..., 3) moved into the box: where the factor is 0, fields are asked at its faces, so that no
+        """Positions (..., 3) moved into the box: where the factor is 0, fields are evaluated at its faces, so that no
         product overflows for points however far."""
         center, reach = self.center.to(positions.dtype), self.reach.to(positions.dtype)
         return positions.clamp(center - reach, center + reach)

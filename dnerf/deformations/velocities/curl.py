@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import check_positive
+from dnerf.core.checks import check_positive
 from dnerf.deformations.velocities.base import BoxWindow, Velocity
-from dnerf.encodings import SinusoidalEncoding
-from dnerf.mlp import MLP
+from dnerf.nn.encodings import SinusoidalEncoding
+from dnerf.nn.mlp import MLP
 
 
 class CurlVelocity(Velocity):
@@ -24,28 +24,20 @@ class CurlVelocity(Velocity):
         hidden_features: width of the time network's two hidden layers.
         time_frequencies: octaves of the times' encoding.
         max_wavenumber: spread (standard deviation per axis) of the waves at initialisation, in radians per world unit.
-        margin: see `BoxWindow`.
-        smoothness: see `BoxWindow`; the velocity has one continuous derivative less than the window.
+        fade, smoothness: see `BoxWindow`; the velocity has one continuous derivative less than the window.
 
     Raises:
         ValueError: for numbers out of range.
     """
 
     def __init__(
-        self,
-        box: Sequence[Sequence[float]],
-        num_waves: int = 64,
-        hidden_features: int = 64,
-        *,
-        time_frequencies: int = 5,
-        max_wavenumber: float = 3.0,
-        margin: float = 0.2,
-        smoothness: int = 4,
-    ) -> None:
+        self, box: Sequence[Sequence[float]], num_waves: int = 64, hidden_features: int = 64, *,
+        time_frequencies: int = 5, max_wavenumber: float = 3.0, fade: float = 0.2, smoothness: int = 4,
+    ) -> None:  # fmt: skip
         super().__init__()
         check_positive("num_waves", num_waves)
         check_positive("max_wavenumber", max_wavenumber)
-        self.window = BoxWindow(box, margin, smoothness)
+        self.window = BoxWindow(box, fade, smoothness)
         self.wavevectors = nn.Parameter(max_wavenumber * torch.randn(num_waves, 3))
         self.phases = nn.Parameter(2 * torch.pi * torch.rand(num_waves))
         self.encode_times = SinusoidalEncoding(1, time_frequencies)

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.checks import as_box, check_positive
+from dnerf.core.checks import as_box, check_positive
 from dnerf.deformations.velocities.base import BoxWindow, Velocity
-from dnerf.encodings import SinusoidalEncoding
-from dnerf.mlp import MLP
+from dnerf.nn.encodings import SinusoidalEncoding
+from dnerf.nn.mlp import MLP
 
 
 class RigidVelocity(Velocity):
@@ -23,27 +23,19 @@ class RigidVelocity(Velocity):
         hidden_features: width of the time network's two hidden layers.
         time_frequencies: octaves of the times' encoding.
         radius: r_c at initialisation, in world units; a quarter of the box's shortest side if None.
-        margin: see `BoxWindow`.
-        smoothness: see `BoxWindow`.
+        fade, smoothness: see `BoxWindow`.
 
     Raises:
         ValueError: for numbers out of range.
     """
 
     def __init__(
-        self,
-        box: Sequence[Sequence[float]],
-        num_clusters: int = 16,
-        hidden_features: int = 64,
-        *,
-        time_frequencies: int = 5,
-        radius: float | None = None,
-        margin: float = 0.1,
-        smoothness: int = 4,
-    ) -> None:
+        self, box: Sequence[Sequence[float]], num_clusters: int = 16, hidden_features: int = 64, *,
+        time_frequencies: int = 5, radius: float | None = None, fade: float = 0.1, smoothness: int = 4,
+    ) -> None:  # fmt: skip
         super().__init__()
         check_positive("num_clusters", num_clusters)
-        self.window = BoxWindow(box, margin, smoothness)
+        self.window = BoxWindow(box, fade, smoothness)
         corners = as_box(box)
         radius = 0.25 * float((corners[1] - corners[0]).min()) if radius is None else radius
         check_positive("radius", radius)

@@ -7,55 +7,33 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
-from .launch import BORROWS, kernel, launch, num_threads
-from .seen_weights import RAYS_AT_ONCE, weigh, weight_tables
-from .tasks import next_task, none_taken
+from .launch import BORROWS, array, kernel, launch, next_task, none_taken, num_threads, offsets_array, rows_array
+from .seen_weights import RAYS_AT_ONCE, weigh
 
 HALF = np.float32(0.5)
 
 
 def add_seen(
-    sums: Tensor,
-    rays: Tensor,
-    light: Tensor,
-    starts: Tensor,
-    ends: Tensor,
-    offsets: Tensor,
-    density: Tensor,
-    rgb: Tensor,
-    distances: Tensor | None,
-) -> Tensor:
-    if offsets[0] != 0 or offsets[-1] != len(starts):
-        raise ValueError(f"offsets must run from 0 to {len(starts)}, got {int(offsets[0])} to {int(offsets[-1])}")
-    if len(rays):
-        first, last = (int(x) for x in rays.aminmax())
-        if first < 0 or last >= len(sums):
-            raise ValueError(f"rays must lie in [0, {len(sums)}), got {first} to {last}")
+    sums: Tensor, rays: Tensor, light: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, density: Tensor,
+    rgb: Tensor, distances: Tensor | None,
+) -> Tensor:  # fmt: skip
     passing = light.new_empty(len(rays))
-    arrays = (x.detach().contiguous().numpy() for x in (rays, light, starts, ends, offsets, density, rgb))
-    points = None if distances is None else distances.detach().contiguous().numpy()
-    weights = weight_tables(len(starts))
-    launch(_add_seen, sums.numpy(), *arrays, points, passing.numpy(), weights, num_threads(), none_taken())
+    rows, bounds = rows_array("rays", rays, len(sums)), offsets_array(offsets, len(starts))
+    light_, starts_, ends_, density_, rgb_ = (array(x) for x in (light, starts, ends, density, rgb))
+    points = None if distances is None else array(distances)
+    launch(
+        _add_seen, sums.numpy(), rows, light_, starts_, ends_, bounds, density_, rgb_, points, passing.numpy(),
+        np.empty((2, len(starts)), np.float32), num_threads(), none_taken(),
+    )  # fmt: skip
     return passing
 
 
 # No fast-math: NaN densities are seen.
 @kernel(**BORROWS)
 def _add_seen(
-    sums: Any,
-    rays: Any,
-    light: Any,
-    starts: Any,
-    ends: Any,
-    offsets: Any,
-    density: Any,
-    rgb: Any,
-    distances: Any,
-    passing: Any,
-    weights: Any,
-    num_workers: int,
-    taken: Any,
-) -> None:
+    sums: Any, rays: Any, light: Any, starts: Any, ends: Any, offsets: Any, density: Any, rgb: Any, distances: Any,
+    passing: Any, weights: Any, num_workers: int, taken: Any,
+) -> None:  # fmt: skip
     for _ in prange(num_workers):
         first = next_task(taken) * RAYS_AT_ONCE
         while first < len(rays):

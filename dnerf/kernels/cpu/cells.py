@@ -1,9 +1,8 @@
 # mypy: disable-error-code="call-arg"
 """Cells of a grid's levels around many places at once, in vector instructions, for use inside numba kernels.
 
-To find a place's cell, its fractions there and its eight table rows takes more instructions than to interpolate. Here
-they are found for `AT_ONCE` places together, one in each lane; what is found is written into a small table of the
-thread's own, and read back place by place.
+To find a place's cell, fractions and eight table rows takes more instructions than to interpolate. Here they are found
+for `AT_ONCE` places together, one in each lane, and written into a small table of the thread's own.
 """
 
 from typing import Any
@@ -20,6 +19,7 @@ from .rows import load, splat, vector_pointer
 PLACES = 256  # of which a thread's table has room
 AT_ONCE = 16
 
+ZERO, ONE, NOWHERE = np.float32(0), np.float32(1), np.float32(np.nan)
 WORD, LONG = ir.IntType(32), ir.IntType(64)
 
 
@@ -52,6 +52,18 @@ def locate_all(places: Any, count: int, level: Any, rows: Any, fractions: Any) -
     numbers = (level[0], level[1], level[2], level[4])
     for i in range(0, count, AT_ONCE):
         _locate_some(places, i, numbers, rows, fractions)
+
+
+@njit(**BORROWS)
+def locate_in_lattice(places: Any, count: int, lattice: Any, rows: Any, fractions: Any) -> None:
+    """`locate_all` of positions, which become shares of a lattice's sides (NaN outside): level, corner, sides."""
+    level, low, sides = lattice
+    for axis in range(3):
+        line = places[axis]
+        for i in range(count):
+            share = (line[i] - low[axis]) / sides[axis]
+            line[i] = share if ZERO <= share <= ONE else NOWHERE
+    locate_all(places, count, level, rows, fractions)
 
 
 @intrinsic
@@ -134,15 +146,6 @@ def _column(array: Any, i: Any, num_lines: int, result: Any) -> tuple[Any, Any]:
         return context.make_tuple(builder, signature.return_type, numbers)
 
     return types.UniTuple(result, num_lines)(array, i), generate
-
-
-@njit(fastmath=FAST, **BORROWS)
-def locate(position: Any, num_cells: int) -> Any:
-    """Lower vertex and fraction along one axis. A NaN gives vertex 0 and fraction NaN, never a wild index."""
-    zero = type(position)(0)
-    scaled = clamped(position) * type(position)(num_cells)
-    lower = min(np.int64(scaled), num_cells - 1) if scaled >= zero else 0
-    return lower, scaled - type(position)(lower)
 
 
 @njit(fastmath=FAST, **BORROWS)

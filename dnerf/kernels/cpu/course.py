@@ -1,37 +1,39 @@
 # mypy: disable-error-code="call-arg,var-annotated"
-"""Which intervals of a ray are kept, for the numba versions of `march` and `trace`."""
+"""Which intervals of a ray are kept, for the numba versions of `march` and `trace_network`."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numba import njit, prange
 
 from ..skip_distances import BLOCK_BITS
-from .launch import BORROWS, kernel
+from .launch import BORROWS, kernel, launch
 
 TESTED_AT_ONCE = 32  # intervals of a ray, by vector instructions; few rays want fewer
-RAYS_AT_ONCE = 64  # neighbours, dealt out to threads in turn: matter fills the middle of a picture
+RAYS_AT_ONCE = 64  # neighbours, dealt out to threads in turn: bodies fill the middle of an image
 LINE = 32  # numbers between what two workers write, so that they share no line of a cache
 
 
-def cells_of_workers(num_workers: int) -> np.ndarray:
+def new_cells(num_workers: int) -> np.ndarray:
     """Each one's scratch for `next_kept`."""
     return np.empty((num_workers, TESTED_AT_ONCE + LINE), np.int32)
 
 
+def ranges_and_bounds(rays: Sequence[np.ndarray], aabb: Any, step: Any, skips: Any) -> tuple[Any, Any, Any]:
+    """What `_ranges` finds of origins, directions, near, far and jitter (R, 3) and (R,), and `_bounds` (K, 3, 2)."""
+    ranges, counts = np.empty((len(rays[0]), 3), rays[0].dtype), np.empty(len(rays[0]), np.int64)
+    launch(_ranges, *rays, aabb, step, ranges, counts)
+    bounds = np.empty((len(skips), 3, 2), np.int64)
+    launch(_bounds, skips, bounds)
+    return ranges, counts, bounds
+
+
 # No fast-math in this file: intervals and cells must round like those of the definition.
 @kernel(**BORROWS)
-def ray_ranges(
-    origins: Any,
-    directions: Any,
-    near: Any,
-    far: Any,
-    jitter: Any,
-    aabb: Any,
-    step: Any,
-    ranges: Any,
-    counts: Any,
+def _ranges(
+    origins: Any, directions: Any, near: Any, far: Any, jitter: Any, aabb: Any, step: Any, ranges: Any, counts: Any
 ) -> None:
     """Per ray: entry, exit and number of the first interval, and how many intervals there may be."""
     for r in prange(len(near)):
@@ -64,7 +66,7 @@ def interval(near: Any, jitter: Any, step: Any, enter: Any, leave: Any, index: A
 
 
 @kernel(**BORROWS)
-def block_bounds(skips: Any, bounds: Any) -> None:
+def _bounds(skips: Any, bounds: Any) -> None:
     """Per slab and axis: the first block with an occupied cell and the one after the last; empty where none is."""
     nk, bx, by, bz = skips.shape
     for k in prange(nk):
@@ -79,12 +81,12 @@ def block_bounds(skips: Any, bounds: Any) -> None:
 
 
 @njit(**BORROWS)
-def _clip(near: Any, far: Any, position: Any, speed: Any, margin: Any, bounds: Any, size: int) -> Any:
+def _clip(near: Any, far: Any, position: Any, speed: Any, dilation: Any, bounds: Any, size: int) -> Any:
     """The part of [near, far] in which `position + speed t` may lie, on one axis, in the cells of the bounds."""
     dtype = type(position)
     # Cells beyond the grid count as those of its faces.
-    low = dtype(bounds[0] << BLOCK_BITS) - margin if bounds[0] > 0 else dtype(-np.inf)
-    high = dtype(bounds[1] << BLOCK_BITS) + margin if bounds[1] << BLOCK_BITS < size else dtype(np.inf)
+    low = dtype(bounds[0] << BLOCK_BITS) - dilation if bounds[0] > 0 else dtype(-np.inf)
+    high = dtype(bounds[1] << BLOCK_BITS) + dilation if bounds[1] << BLOCK_BITS < size else dtype(np.inf)
     if bounds[0] >= bounds[1] or (speed == 0 and not low <= position <= high):
         return near, dtype(-np.inf)
     if speed == 0:
@@ -95,27 +97,16 @@ def _clip(near: Any, far: Any, position: Any, speed: Any, margin: Any, bounds: A
 
 @njit(**BORROWS)
 def course_of(
-    origin: Any,
-    direction: Any,
-    near: Any,
-    jitter: Any,
-    step: Any,
-    span: Any,
-    count: Any,
-    shape: Any,
-    bounds: Any,
+    origin: Any, direction: Any, near: Any, jitter: Any, step: Any, span: Any, count: Any, shape: Any, bounds: Any,
     aabb: Any,
-) -> Any:
+) -> Any:  # fmt: skip
     """The first interval that may be kept, the one after the last, and what `next_kept` has to know of a ray.
 
     Args:
-        origin, direction, near, jitter: the ray's.
-        step: length of an interval.
-        span: entry, exit and number of the first interval, see `ray_ranges`.
-        count: how many intervals there may be.
-        shape: Gx, Gy, Gz of the grid.
-        bounds: (3, 2), the slab's, see `block_bounds`.
-        aabb: (2, 3) box of the grid.
+        origin, direction, near, jitter, step: of the ray and its intervals.
+        span, count: entry, exit, number of the first interval, and how many there may be, see `_ranges`.
+        shape, aabb: Gx, Gy, Gz of the grid, and its box (2, 3).
+        bounds: (3, 2), the slab's, see `_bounds`.
     """
     dtype = type(near)
     rounding = dtype(8) * dtype(np.finfo(dtype).eps)
@@ -131,14 +122,9 @@ def course_of(
     margin_z = _margin(rounding, oz, dz, aabb[0, 2], scale_z, leave, nz)
     slack = rounding * max(abs(near), abs(leave)) + dtype(1e-3) * step
     course = (
-        (ox, oy, oz),
-        (dx, dy, dz),
-        (aabb[0, 0], aabb[0, 1], aabb[0, 2]),
-        (scale_x, scale_y, scale_z),
-        (margin_x, margin_y, margin_z),
-        (near, jitter, step, enter, leave, first, slack),
-        (nx, ny, nz),
-    )
+        (ox, oy, oz), (dx, dy, dz), (aabb[0, 0], aabb[0, 1], aabb[0, 2]), (scale_x, scale_y, scale_z),
+        (margin_x, margin_y, margin_z), (near, jitter, step, enter, leave, first, slack), (nx, ny, nz),
+    )  # fmt: skip
     begin, finish = enter, leave
     u, v, w = (ox - aabb[0, 0]) * scale_x, (oy - aabb[0, 1]) * scale_y, (oz - aabb[0, 2]) * scale_z
     begin, finish = _clip(begin, finish, u, dx * scale_x, margin_x, bounds[0], nx)
@@ -157,11 +143,9 @@ def next_kept(j: int, count: int, course: Any, occupancy: Any, skips: Any, cells
     """From interval j on, where some in a row hold the first kept one, and the bits of those kept; 0 if none is.
 
     Args:
-        j: number of the interval to begin at.
-        count: of the one after the last.
+        j, count: numbers of the interval to begin at, and of the one after the last.
         course: of the ray, see `course_of`.
-        occupancy: (Gx Gy Gz,), the ray's slab.
-        skips: its `skip_distances`.
+        occupancy, skips: (Gx Gy Gz,), the ray's slab, and its `skip_distances`.
         cells: (TESTED_AT_ONCE,) int32, scratch.
 
     Returns:
@@ -180,13 +164,6 @@ def next_kept(j: int, count: int, course: Any, occupancy: Any, skips: Any, cells
         if bits == 0:
             j += TESTED_AT_ONCE
     return j, bits
-
-
-@njit(forceinline=True, **BORROWS)
-def ends_of(j: int, course: Any) -> Any:
-    """Where an interval begins and ends."""
-    near, jitter, step, enter, leave, first, _ = course[5]
-    return interval(near, jitter, step, enter, leave, first + type(near)(j))
 
 
 @njit(forceinline=True, **BORROWS)
@@ -214,7 +191,7 @@ def _locate(j: int, course: Any, cells: Any) -> None:
 @njit(forceinline=True, **BORROWS)
 def _jump(j: int, course: Any, skips: Any) -> int:
     """How many intervals from j on certainly lie in empty blocks; 0 in a block that is not empty."""
-    origin, direction, low, scale, margin, along, (nx, ny, nz) = course
+    origin, direction, low, scale, dilation, along, (nx, ny, nz) = course
     near, jitter, step, enter, leave, first, slack = along
     dtype = type(near)
     half = dtype(0.5)
@@ -229,9 +206,9 @@ def _jump(j: int, course: Any, skips: Any) -> int:
     if radius == 0:
         return 0
     free = leave - middle
-    free = min(free, _free(u, x, radius, direction[0] * scale[0], margin[0]))
-    free = min(free, _free(v, y, radius, direction[1] * scale[1], margin[1]))
-    free = min(free, _free(w, z, radius, direction[2] * scale[2], margin[2]))
+    free = min(free, _free(u, x, radius, direction[0] * scale[0], dilation[0]))
+    free = min(free, _free(v, y, radius, direction[1] * scale[1], dilation[1]))
+    free = min(free, _free(w, z, radius, direction[2] * scale[2], dilation[2]))
     edge = near + (index + jitter) * step
     return 1 + max(int((middle + free - slack - edge) / step + half), 0)
 
@@ -243,7 +220,7 @@ def _margin(rounding: Any, o: Any, d: Any, lower: Any, scale: Any, leave: Any, s
 
 
 @njit(forceinline=True, **BORROWS)
-def _free(position: Any, cell: int, radius: int, speed: Any, margin: Any) -> Any:
+def _free(position: Any, cell: int, radius: int, speed: Any, dilation: Any) -> Any:
     """Distance along the ray that surely stays, on one axis, within the blocks closer than `radius`."""
     dtype = type(position)
     if speed == 0:
@@ -253,4 +230,4 @@ def _free(position: Any, cell: int, radius: int, speed: Any, margin: Any) -> Any
         cells = dtype((block + radius) << BLOCK_BITS) - position
     else:
         cells = position - dtype((block - radius + 1) << BLOCK_BITS)
-    return max(cells - margin, dtype(0)) / abs(speed)
+    return max(cells - dilation, dtype(0)) / abs(speed)

@@ -6,20 +6,14 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from ..covered_places import MOST_AXES
-from .launch import BORROWS, kernel
+from .launch import BORROWS, array, kernel
 
 
 def covered_places(lows: Tensor, ends: Tensor, shape: tuple[int, ...]) -> Tensor:
-    lacking = MOST_AXES - len(shape)  # axes of one place, in front
-    sides = (1,) * lacking + shape
-    lows, ends = pad(lows, (0, 0, lacking, 0)), pad(ends, (0, 0, lacking, 0), value=1)
-    out = torch.empty(math.prod(sides), dtype=torch.int64)
-    changes, is_touched = np.empty((*sides[:2], sides[2] + 1), np.int32), np.zeros(sides[:2], np.bool_)
-    count = _covered(lows.contiguous().numpy(), ends.contiguous().numpy(), changes, is_touched, out.numpy())
-    return out[:count]
+    out = torch.empty(math.prod(shape), dtype=torch.int64)
+    changes, is_touched = np.empty((*shape[:2], shape[2] + 1), np.int32), np.zeros(shape[:2], np.bool_)
+    return out[: _covered(array(lows), array(ends), changes, is_touched, out.numpy())]
 
 
 # One thread: starting a second one takes as long as half of this.

@@ -1,9 +1,8 @@
 # mypy: disable-error-code="attr-defined,call-arg"
 """Layers of networks in bfloat16, for use inside numba kernels, on processors that multiply vectors of such numbers.
 
-Matrix libraries go through all rows layer by layer, and through memory in between, which takes narrow layers as long as
-their arithmetic. Here sums for a group of rows stay in registers while a layer's weights pass by, which fit the nearest
-cache, and a few hundred rows go through all layers before the next ones begin.
+Matrix libraries go through all rows layer by layer, and memory in between. Here sums for a group of rows stay in
+registers while a layer's weights pass by, and a few hundred rows go through all layers before the next ones begin.
 """
 
 from collections.abc import Sequence
@@ -19,6 +18,8 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from torch import Tensor
+
+from dnerf.core.checks import check_shape
 
 from .launch import BORROWS
 from .rows import splat, vector_pointer
@@ -72,8 +73,7 @@ class Packed:
 
     Args:
         in_features: of the first layer.
-        weights: of each layer, (out_features, in_features) in bfloat16, an even number of inputs.
-        biases: of each layer, (out_features,).
+        weights, biases: of each layer, (out_features, in_features) in bfloat16 of an even number, and (out_features,).
         vectors: of outputs that each layer finds at once; the last outputs are padded with zeros.
 
     Attributes:
@@ -88,7 +88,11 @@ class Packed:
     def __init__(
         self, in_features: int, weights: Sequence[Tensor], biases: Sequence[Tensor], vectors: Sequence[int]
     ) -> None:
-        _check(in_features, weights, biases)
+        expected = in_features
+        for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            check_shape(f"weights of layer {i}", weight, ("n", expected))
+            check_shape(f"biases of layer {i}", bias, weight.shape[:1])
+            expected = len(weight)
         layers, num_weights, num_outputs = [], 0, 0
         for weight, count in zip(weights, vectors, strict=True):
             out_features, in_features = weight.shape
@@ -101,16 +105,6 @@ class Packed:
         for (_, _, start, first), weight, bias, count in zip(layers, weights, biases, vectors, strict=True):
             _pack(bits_of(weight), self.weights[start:], count * LANES)
             self.biases[first : first + len(bias)] = bias.detach().bfloat16().float().numpy()
-
-
-def _check(in_features: int, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
-    for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        if weight.ndim != 2 or weight.shape[1] != in_features or bias.shape != (len(weight),):
-            raise ValueError(
-                f"weights and biases of layer {i} must have shapes (n, {in_features}) and (n,), got "
-                f"{tuple(weight.shape)} and {tuple(bias.shape)}"
-            )
-        in_features = len(weight)
 
 
 def bits_of(tensor: Tensor) -> np.ndarray:
@@ -137,15 +131,10 @@ def dense(
     bfloat16 (uint16), W x + b for outputs in float32.
 
     Args:
-        inputs: flat, uint16.
-        from_row: of the inputs, the first one.
-        layer: of `Packed.layers`.
-        weights, biases: of `Packed`.
-        out: flat, in rows as long as the layer's blocks are.
-        to_row: of the outputs, the first one.
-        count: of rows.
-        group: a tuple as long as rows at once are many.
-        vectors: a tuple as long as vectors of outputs at once are many.
+        inputs, from_row: flat, uint16, and the first row of them.
+        layer, weights, biases: of `Packed`.
+        out, to_row: flat, in rows as long as the layer's blocks are, and the first row of them.
+        group, vectors: tuples as long as rows, and vectors of outputs, at once are many.
     """
     pairs, blocks, start, first = layer
     columns = len(vectors) * LANES
@@ -187,10 +176,8 @@ def _dense_rows(
         )
         with cgutils.for_range(builder, pairs_) as loop:
             here = after(start_, loop.index, 2 * LANES * vectors.count)
-            passing = [
-                builder.load(data(weights, weights_, after(here, n, 2 * LANES), PAIRS), align=2)
-                for n in range(vectors.count)
-            ]
+            parts = [data(weights, weights_, after(here, n, 2 * LANES), PAIRS) for n in range(vectors.count)]
+            passing = [builder.load(part, align=2) for part in parts]
             for row, line in enumerate(sums):
                 at = after(after(first_, row, builder.mul(pairs_, long(2))), loop.index, 2)
                 pair = builder.load(data(inputs, inputs_, at, WORD), align=2)

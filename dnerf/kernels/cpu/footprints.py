@@ -11,26 +11,19 @@ from numba import njit
 from torch import Tensor
 
 from ..footprints import Footprints
-from .launch import BORROWS, kernel
+from .launch import BORROWS, array, kernel
 
 
 def footprints(
     pose: Tensor, places: Tensor, faces: Sequence[Tensor], lens: Sequence[float], size: tuple[int, int]
 ) -> Footprints | None:
-    pixels = torch.empty(size[0] * size[1], dtype=torch.int64)
-    depths = pose.new_empty(2, *size)
+    pixels, depths = torch.empty(size[0] * size[1], dtype=torch.int64), pose.new_empty(2, *size)
     packed = torch.empty_like(depths).view(2, -1)
-    real = pose.detach().contiguous().numpy()
+    real = array(pose)
     count = _footprints(
-        real,
-        places.numpy(),
-        tuple(face.numpy() for face in faces),
-        np.asarray(lens, real.dtype),
-        depths.numpy(),
-        np.zeros(size[0], np.bool_),
-        pixels.numpy(),
-        packed.numpy(),
-    )
+        real, places.numpy(), tuple(face.numpy() for face in faces), np.asarray(lens, real.dtype), depths.numpy(),
+        np.zeros(size[0], np.bool_), pixels.numpy(), packed.numpy(),
+    )  # fmt: skip
     return None if count < 0 else Footprints(pixels[:count], packed[:, :count])
 
 

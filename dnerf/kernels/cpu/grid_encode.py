@@ -11,37 +11,28 @@ from torch import Tensor
 
 from ..grid_encode import GridLevels
 from .cells import PLACES, cell_tables, fractions_at, locate_all, rows_at, take_places, trilinear_weights
-from .launch import BORROWS, FAST, kernel, launch, num_threads
+from .dense import bits_of
+from .launch import BORROWS, FAST, array, kernel, launch, next_task, none_taken, num_threads
 from .rows import add_to_row, blend_rows, dot_slopes
-from .tasks import next_task, none_taken
 
 # A table gradient's rows are dealt out in blocks of 2^6: fine enough to balance crowded regions of a dense level.
 ROW_BLOCK_BITS = 6
 
 
-def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    out = table.new_empty((positions.shape[0], len(cells) // 3 * table.shape[1]))
-    _launch_forward(positions, table, cells, max_rows, out.numpy())
-    return out
-
-
-def forward_rounded(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    out = table.new_empty((positions.shape[0], len(cells) // 3 * table.shape[1]), dtype=torch.bfloat16)
-    bits = out.view(torch.int16).numpy().view(np.uint16)
-    _launch_forward(positions, table, cells, max_rows, bits)
-    return out
-
-
-def _launch_forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int, out: np.ndarray) -> None:
+def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int, rounded: bool) -> Tensor:
     levels, lanes = levels_of(tuple(cells), max_rows), (0,) * table.shape[1]
-    launch(_forward, _array(positions), _array(table), levels, out, *_workers(positions), lanes)
+    size, dtype = (len(positions), len(levels) * len(lanes)), torch.bfloat16 if rounded else table.dtype
+    out = table.new_empty(size, dtype=dtype)
+    numbers = bits_of(out) if rounded else out.numpy()
+    launch(_forward, array(positions), array(table), levels, numbers, *_workers(positions), lanes)
+    return out
 
 
 def grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     levels, lanes = levels_of(tuple(cells), max_rows), (0,) * table.shape[1]
     out = torch.zeros_like(table, memory_format=torch.contiguous_format)
     part_bits = max(0, (num_threads() - 1) // len(levels)).bit_length()
-    arrays = _array(grad), _array(positions)
+    arrays = array(grad), array(positions)
     launch(_grad_table, *arrays, levels, part_bits, out.numpy(), *_workers(positions), lanes)
     return out
 
@@ -49,7 +40,7 @@ def grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int],
 def grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
     levels, lanes = levels_of(tuple(cells), max_rows), (0,) * table.shape[1]
     out = torch.empty_like(positions, memory_format=torch.contiguous_format)
-    arrays = _array(grad), _array(positions), _array(table)
+    arrays = array(grad), array(positions), array(table)
     launch(_grad_positions, *arrays, levels, out.numpy(), *_workers(positions), lanes)
     return out
 
@@ -58,10 +49,6 @@ def _workers(positions: Tensor) -> tuple[Any, int, np.ndarray]:
     """Tables for as many workers as there are threads, their number, and the counter of the tasks they take."""
     threads = num_threads()
     return cell_tables(positions.detach().numpy().dtype, threads), threads, none_taken()
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
 
 
 @lru_cache(maxsize=64)
@@ -92,16 +79,9 @@ def _forward(
 
 @kernel(fastmath=FAST, **BORROWS)
 def _grad_table(
-    grad: Any,
-    positions: Any,
-    levels: Any,
-    part_bits: int,
-    out: Any,
-    tables: Any,
-    num_workers: int,
-    taken: Any,
+    grad: Any, positions: Any, levels: Any, part_bits: int, out: Any, tables: Any, num_workers: int, taken: Any,
     lanes: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Scatter-add without atomics: a task owns one level, or every 2^part_bits-th block of its rows.
 
     Each row is added to by one thread, in the order of the samples: the result depends on no thread count. Fine levels
@@ -147,9 +127,8 @@ def _grad_positions(
                 locate_all(places, count, level, rows, fractions)
                 start = first * grad.shape[1] + j * len(lanes)
                 for i in range(count):
-                    along = dot_slopes(
-                        table, level[3], rows_at(rows, i), fractions_at(fractions, i), grad, start, lanes
-                    )
+                    shares = fractions_at(fractions, i)
+                    along = dot_slopes(table, level[3], rows_at(rows, i), shares, grad, start, lanes)
                     for axis in range(3):
                         out[first + i, axis] += along[axis] * real(level[axis])
                     start += grad.shape[1]

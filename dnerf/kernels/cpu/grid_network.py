@@ -9,19 +9,19 @@ from numba import njit, prange
 from torch import Tensor
 
 from .cells import PLACES, cell_tables, fractions_at, locate_all, rows_at, take_places
-from .dense import LANES, MOST_ROWS, ROWS_OF, Packed, dense, is_supported, vectors_at_once
+from .dense import LANES, MOST_ROWS, ROWS_OF, Packed, dense, has_vectors, is_supported, vectors_at_once
 from .grid_encode import levels_of
-from .launch import BORROWS, FAST, kernel, launch, num_threads
+from .launch import BORROWS, FAST, array, kernel, launch, next_task, none_taken, num_threads
 from .rows import blend_rows
-from .tasks import next_task, none_taken
 
 ROOM = PLACES + MOST_ROWS  # rows of a worker's tables: groups are full
 
 
-def serves(positions: Tensor, in_features: int, weights: Sequence[Tensor]) -> bool:
+def serves(positions: Tensor, in_features: int, weights: Sequence[Tensor], beside_tiles: bool) -> bool:
     """Whether networks of such sizes are served on this processor."""
     is_narrow = len(weights) > 1 and len(weights[-1]) <= LANES
-    return is_supported() and in_features % 2 == 0 and is_narrow and all(len(w) % LANES == 0 for w in weights[:-1])
+    can = has_vectors() if beside_tiles else is_supported()
+    return can and in_features % 2 == 0 and is_narrow and all(len(w) % LANES == 0 for w in weights[:-1])
 
 
 Widths = tuple[tuple[int, ...], ...]
@@ -34,7 +34,7 @@ def network_of(
     vectors = vectors_at_once([len(weight) for weight in weights[:-1]])
     levels = levels_of(tuple(cells), max_rows)
     packed = Packed(len(levels) * table.shape[1], weights, biases, [vectors] * (len(weights) - 1) + [1])
-    arrays = table.detach().contiguous().numpy(), levels, packed.layers, packed.weights, packed.biases
+    arrays = array(table), levels, packed.layers, packed.weights, packed.biases
     return arrays, tuple((0,) * n for n in (table.shape[1], ROWS_OF[vectors], vectors, ROWS_OF[1], 1))
 
 
@@ -54,7 +54,7 @@ def forward(
     network, widths = network_of(table, cells, max_rows, weights, biases)
     out, workers = positions.new_empty(len(positions), len(weights[-1])), num_threads()
     room, tables = room_of(weights, workers), cell_tables(np.float32, workers)
-    launch(_network, positions.detach().contiguous().numpy(), out.numpy(), network, room, tables, none_taken(), *widths)
+    launch(_network, array(positions), out.numpy(), network, room, tables, none_taken(), *widths)
     return out
 
 

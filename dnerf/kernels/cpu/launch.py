@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined"
-"""Compiling numba kernels, and starting them on as many threads as torch uses."""
+"""Compiling numba kernels, and what they are started with: arrays, and tasks for as many threads as torch uses."""
 
 import hashlib
 import os
@@ -11,7 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import torch
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from torch import Tensor
 
 # OpenMP first: its pool gets along with torch's, where the other layers' threads fight torch's spinning workers
 # for the cores (measured: 6 ms lost per switch with workqueue), and it may be entered from several Python threads.
@@ -79,3 +84,40 @@ def launch(kernel: Callable[..., Any], *arguments: Any) -> None:
 def _turn() -> Any:
     """A lock if numba could only find its own pool, which two threads must not enter together; else nothing."""
     return threading.Lock() if numba.threading_layer() == "workqueue" else nullcontext()
+
+
+def none_taken() -> np.ndarray:
+    """The counter that `next_task` wants; tasks are dealt out as threads come free: a slow core holds nobody up."""
+    return np.zeros(1, np.int64)
+
+
+@intrinsic
+def next_task(typing: Any, taken: Any) -> tuple[Any, Any]:
+    """The number of the next task, counted from 0, that no thread has taken."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        counter = context.make_array(taken)(context, builder, arguments[0]).data
+        return builder.atomic_rmw("add", counter, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return types.int64(taken), generate
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """The numbers of a tensor, contiguous."""
+    return tensor.detach().contiguous().numpy()
+
+
+def offsets_array(offsets: Tensor, num_samples: int) -> np.ndarray:
+    """Offsets (R + 1,) that run from 0 to the number of samples, or a ValueError."""
+    numbers = array(offsets)
+    if numbers[0] != 0 or numbers[-1] != num_samples:
+        raise ValueError(f"offsets must run from 0 to {num_samples}, got {numbers[0]} to {numbers[-1]}")
+    return numbers
+
+
+def rows_array(name: str, rows: Tensor, size: int) -> np.ndarray:
+    """Numbers of rows of a table of so many, or a ValueError."""
+    numbers = array(rows)
+    if len(numbers) and (numbers.min() < 0 or numbers.max() >= size):
+        raise ValueError(f"{name} must lie in [0, {size}), got {numbers.min()} to {numbers.max()}")
+    return numbers

@@ -8,97 +8,52 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from .course import (
-    RAYS_AT_ONCE,
-    TESTED_AT_ONCE,
-    block_bounds,
-    cells_of_workers,
-    course_of,
-    interval,
-    next_kept,
-    ray_ranges,
-)
-from .launch import BORROWS, kernel, launch, num_threads
+from .course import RAYS_AT_ONCE, TESTED_AT_ONCE, course_of, interval, new_cells, next_kept, ranges_and_bounds
+from .launch import BORROWS, array, kernel, launch, next_task, none_taken, num_threads
 from .rows import trailing_zeros
 from .skip_distances import skip_distances
-from .tasks import next_task, none_taken
 
 
 def march(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: float,
-    max_samples_per_ray: int | None,
-    skips: Tensor | None,
+    occupancy: Tensor, rays: list[Tensor], aabb: Tensor, step: float, limit: int | None, skips: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    o, d, t0, t1, times_, jitter_, box = (
-        x.detach().contiguous().numpy() for x in (origins, directions, near, far, times, jitter, aabb)
-    )
+    o, d, t0, t1, times, jitter, box = (array(x) for x in (*rays, aabb))
     size = o.dtype.type(step)
-    ranges = np.empty((len(o), 3), o.dtype)
-    counts = np.empty(len(o), np.int64)
-    launch(ray_ranges, o, d, t0, t1, jitter_, box, size, ranges, counts)
+    grid, reach = array(occupancy), array(skip_distances(occupancy) if skips is None else skips)
+    ranges, counts, bounds = ranges_and_bounds((o, d, t0, t1, jitter), box, size, reach)
 
     kept = np.zeros((len(o), (counts.max(initial=0) + 63) // 64), np.uint64)
     offsets = torch.zeros(len(o) + 1, dtype=torch.int64)
-    limit = np.iinfo(np.int64).max if max_samples_per_ray is None else max_samples_per_ray
-    grid = occupancy.contiguous().numpy()
-    if skips is None:
-        skips = skip_distances(occupancy)
-    reach = skips.contiguous().numpy()
-    bounds = np.empty((len(grid), 3, 2), np.int64)
-    launch(block_bounds, reach, bounds)
+    most = np.iinfo(np.int64).max if limit is None else limit
     slabs = grid.reshape(len(grid), -1)
-    arguments = (o, d, t0, times_, jitter_, slabs, grid.shape[1:], reach, bounds, box, size, limit, ranges, counts)
-    launch(_mark, *arguments, kept, offsets.numpy(), cells_of_workers(num_threads()), none_taken())
+    launch(
+        _mark, (o, d, t0, times, jitter, ranges, counts), (slabs, grid.shape[1:], reach, bounds, box, size), most,
+        kept, offsets.numpy(), new_cells(num_threads()), none_taken(),
+    )  # fmt: skip
     torch.cumsum(offsets, 0, out=offsets)
 
     num_samples = int(offsets[-1])
-    starts, ends = origins.new_empty(num_samples), origins.new_empty(num_samples)
+    starts, ends = rays[0].new_empty(num_samples), rays[0].new_empty(num_samples)
     ray_indices = offsets.new_empty(num_samples)
     arrays = (starts.numpy(), ends.numpy(), ray_indices.numpy())
-    launch(_fill, t0, jitter_, size, ranges, kept, offsets.numpy(), *arrays)
+    launch(_fill, t0, jitter, size, ranges, kept, offsets.numpy(), *arrays)
     return starts, ends, ray_indices, offsets
 
 
 # No fast-math in this file: intervals must round like those of the definition.
 @kernel(**BORROWS)
-def _mark(
-    origins: Any,
-    directions: Any,
-    near: Any,
-    times: Any,
-    jitter: Any,
-    occupancy: Any,
-    shape: Any,
-    skips: Any,
-    bounds: Any,
-    aabb: Any,
-    step: Any,
-    limit: int,
-    ranges: Any,
-    counts: Any,
-    kept: Any,
-    offsets: Any,
-    cells: Any,
-    taken: Any,
-) -> None:
+def _mark(rays: Any, grid: Any, limit: int, kept: Any, offsets: Any, cells: Any, taken: Any) -> None:
     """Set a bit for every kept interval, and count them.
 
-    A ray is followed through the bounds of its slab's occupied blocks; one that misses them costs nothing. From an
-    empty block the march jumps over the intervals whose midpoints are certain to lie in empty blocks too.
-    Midpoints round monotonically, and so do the cells computed from them; the margins exceed the rounding of the
-    distance to where the empty blocks end. So the result is that of testing every interval.
+    A ray is followed through the bounds of its slab's occupied blocks. From an empty block the march jumps over the
+    intervals whose midpoints are certain to lie in empty blocks too. Midpoints round monotonically, and so do the cells
+    computed from them; the margins exceed the rounding of the distance to where the empty blocks end. So the result is
+    that of testing every interval.
     """
-    num_workers = len(cells)
+    origins, directions, near, times, jitter, ranges, counts = rays
+    occupancy, shape, skips, bounds, aabb, step = grid
     num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
-    for worker in prange(num_workers):
+    for worker in prange(len(cells)):
         group = next_task(taken)
         while group < num_groups:
             for r in range(group * RAYS_AT_ONCE, min((group + 1) * RAYS_AT_ONCE, len(near))):
@@ -123,15 +78,7 @@ def _mark(
 
 @kernel(**BORROWS)
 def _fill(
-    near: Any,
-    jitter: Any,
-    step: Any,
-    ranges: Any,
-    kept: Any,
-    offsets: Any,
-    starts: Any,
-    ends: Any,
-    ray_indices: Any,
+    near: Any, jitter: Any, step: Any, ranges: Any, kept: Any, offsets: Any, starts: Any, ends: Any, ray_indices: Any
 ) -> None:
     dtype = near.dtype.type
     for r in prange(len(near)):

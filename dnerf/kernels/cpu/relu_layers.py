@@ -10,8 +10,7 @@ from numba import prange
 from torch import Tensor
 
 from .dense import LANES, MOST_ROWS, ROWS_OF, Packed, bits_of, dense, is_supported, vectors_at_once
-from .launch import BORROWS, kernel, launch, num_threads
-from .tasks import next_task, none_taken
+from .launch import BORROWS, kernel, launch, next_task, none_taken, num_threads
 
 ROWS = 252  # dealt out to threads
 

@@ -1,8 +1,7 @@
 """Vector instructions on rows of a contiguous 2-D array, for use inside numba kernels.
 
-numba's loop over a row's few features neither unrolls nor vectorises well, since LLVM must assume that the arrays
-overlap. These intrinsics emit one vector operation per row; its width is the length of the tuple `lanes`, which
-makes it a compile-time constant.
+numba's loops over a row's few features vectorise badly: LLVM must assume that arrays overlap. These intrinsics
+emit one vector operation per row; its width is the length of the tuple `lanes`, a compile-time constant.
 """
 
 from typing import Any
@@ -23,11 +22,7 @@ def vector_pointer(context: Any, builder: Any, array_type: Any, array: Any, star
 
 
 def load(context: Any, builder: Any, array_type: Any, array: Any, start: Any, width: int) -> Any:
-    """So many consecutive elements of an array from flat index `start`; half precision becomes single."""
-    if array_type.dtype == types.uint16:  # half precision: numba has no such numbers, processors do
-        data = context.make_array(array_type)(context, builder, array).data
-        pointer = builder.bitcast(builder.gep(data, [start]), ir.VectorType(ir.HalfType(), width).as_pointer())
-        return builder.fpext(builder.load(pointer, align=2), ir.VectorType(ir.FloatType(), width))
+    """So many consecutive elements of an array from flat index `start`."""
     pointer = vector_pointer(context, builder, array_type, array, start, width)
     return builder.load(pointer, align=array_type.dtype.bitwidth // 8)
 
@@ -47,9 +42,8 @@ def blend_rows(
     """out.flat[start : start + F] = the trilinear interpolation of eight rows table[first + rows[k]].
 
     Bit 0 of k belongs to the first fraction, bit 1 to the second and bit 2 to the third. Pair after pair, which takes
-    half the instructions that a sum of eight rows with their weights does. A table in half precision is given as
-    uint16; fractions and `out` are then in single precision. `out` in bfloat16 is given as uint16, too; it gets numbers
-    of single precision, rounded to the nearest, ties to even.
+    half the instructions that a sum of eight rows with their weights does. `out` in bfloat16 is given as uint16; it
+    gets numbers of single precision, rounded to the nearest, ties to even.
     """
     width = lanes.count
 
@@ -99,25 +93,6 @@ def _rounded(builder: Any, values: Any, width: int) -> Any:
     is_nan = builder.fcmp_unordered("uno", values, values)
     kept = builder.select(is_nan, constant(0x7FC00000), rounded)
     return builder.trunc(builder.lshr(kept, constant(16)), ir.VectorType(ir.IntType(16), width))
-
-
-@intrinsic
-def prefetch_row(typing: Any, table: Any, row: Any) -> tuple[Any, Any]:
-    """Ask for the memory in which a row begins; it is read later."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = context.make_array(table)(context, builder, arguments[0])
-        width = builder.extract_value(array.shape, 1)
-        byte = ir.IntType(8).as_pointer()
-        pointer = builder.bitcast(builder.gep(array.data, [builder.mul(arguments[1], width)]), byte)
-        flag = ir.IntType(32)
-        function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag]), "llvm.prefetch.p0"
-        )
-        builder.call(function, [pointer, flag(0), flag(3), flag(1)])  # to read, to keep, data
-        return context.get_dummy_value()
-
-    return types.void(table, row), generate
 
 
 @intrinsic

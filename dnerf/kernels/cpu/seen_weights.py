@@ -6,27 +6,24 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from ..packed_weights import MOST_DENSITY
 from .exponential import exp, expm1
 from .launch import BORROWS
 
 RAYS_AT_ONCE = 64  # dealt out to threads
 OPAQUE = np.float32(87)  # optical depth, behind which there is no light in single precision
-NOTHING = np.float32(0)
-
-
-def weight_tables(num_samples: int) -> np.ndarray:
-    """Room (2, N) for the samples' weights, and for the optical depths before them."""
-    return np.empty((2, num_samples), np.float32)
+NOTHING, MOST = np.float32(0), np.float32(MOST_DENSITY)
 
 
 # No fast-math: NaN densities are seen.
 @njit(**BORROWS)
 def weigh(starts: Any, ends: Any, offsets: Any, density: Any, first: int, last: int, weights: Any, before: Any) -> None:
-    """The weights of the samples of rays `first` to `last`; exponentials are of many samples at a time."""
+    """Weights (N,) of the samples of rays `first` to `last`, and optical depths before them (N,)."""
     for r in range(first, last):
         total = 0.0
         for i in range(offsets[r], offsets[r + 1]):
-            depth = density[i] * (ends[i] - starts[i])
+            dense = MOST if density[i] > MOST else density[i]
+            depth = dense * (ends[i] - starts[i])
             weights[i], before[i] = depth, total
             total += depth
     # Slices, counted from 0: where an index might be negative no vector instructions are used.

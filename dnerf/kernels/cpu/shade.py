@@ -11,17 +11,16 @@ from numba.extending import intrinsic
 from torch import Tensor
 
 from ..shade import MOST_LOG_DENSITY
+from .dense import bits_of
 from .exponential import exp, sigmoid
-from .launch import BORROWS, kernel, launch, num_threads
-from .tasks import next_task, none_taken
+from .launch import BORROWS, array, kernel, launch, next_task, none_taken, num_threads
 
 ROWS = 256  # dealt out to threads
 MOST = np.float32(MOST_LOG_DENSITY)
 
 
 def shade(raw: Tensor, bias: Tensor, log_shift: float) -> tuple[Tensor, Tensor]:
-    raw = raw.detach().contiguous()
-    values = raw.view(torch.uint16).numpy() if raw.dtype == torch.bfloat16 else raw.numpy()
+    values = bits_of(raw) if raw.dtype == torch.bfloat16 else array(raw)
     density, rgb = bias.new_empty(len(raw)), bias.new_empty(len(raw), 3)
     shifts = bias.detach() + bias.new_tensor([log_shift, 0, 0, 0])
     lines = np.zeros((num_threads(), 4, ROWS), np.float32)

@@ -12,9 +12,8 @@ from .launch import kernel, launch
 
 
 def skip_distances(occupancy: Tensor) -> Tensor:
-    cells = occupancy.contiguous()
-    out = torch.empty(blocks_shape(occupancy), dtype=torch.uint8, device=occupancy.device)
-    launch(_any, cells.view(torch.uint8).numpy(), out.numpy())
+    out = torch.empty(blocks_shape(occupancy), dtype=torch.uint8)
+    launch(_any, occupancy.contiguous().view(torch.uint8).numpy(), out.numpy())
     launch(_distances, out.numpy())
     return out
 

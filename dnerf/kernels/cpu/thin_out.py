@@ -9,14 +9,13 @@ from numba import njit
 from torch import Tensor
 
 from ..thin_out import STRAIGHT
-from .launch import BORROWS, kernel
+from .launch import BORROWS, array, kernel
 
 
 def thin_out(points: Tensor, times: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
     chosen, before = torch.empty(len(points), dtype=torch.int64), torch.empty(len(points), dtype=torch.int64)
     fractions = torch.zeros_like(times, dtype=points.dtype, memory_format=torch.contiguous_format)
-    arrays = (x.detach().contiguous().numpy() for x in (points, times))
-    count = _thin_out(*arrays, spacing, chosen.numpy(), before.numpy(), fractions.numpy())
+    count = _thin_out(array(points), array(times), spacing, chosen.numpy(), before.numpy(), fractions.numpy())
     return chosen[:count], before, fractions
 
 
@@ -53,11 +52,8 @@ def _thin_out(points: Any, times: Any, spacing: float, chosen: Any, before: Any,
 @njit(**BORROWS)
 def _step(points: Any, i: int, j: int) -> Any:
     """From one point to another."""
-    return (
-        np.float64(points[j, 0]) - np.float64(points[i, 0]),
-        np.float64(points[j, 1]) - np.float64(points[i, 1]),
-        np.float64(points[j, 2]) - np.float64(points[i, 2]),
-    )
+    a, b = points[i], points[j]
+    return np.float64(b[0]) - np.float64(a[0]), np.float64(b[1]) - np.float64(a[1]), np.float64(b[2]) - np.float64(a[2])
 
 
 @njit(**BORROWS)

@@ -5,31 +5,20 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
 from numba import njit, prange
 from torch import Tensor
 
 from ..shade import MOST_LOG_DENSITY
-from ..trace import NUM_STATES
-from .cells import PLACES, cell_tables, clamped, fractions_at, locate_all, rows_at
-from .course import (
-    LINE,
-    RAYS_AT_ONCE,
-    TESTED_AT_ONCE,
-    block_bounds,
-    cells_of_workers,
-    course_of,
-    interval,
-    next_kept,
-    ray_ranges,
-)
+from ..trace_network import NUM_STATES, FrameTables
+from .cells import PLACES, cell_tables, clamped, fractions_at, locate_in_lattice, rows_at
+from .course import LINE, RAYS_AT_ONCE, TESTED_AT_ONCE, course_of, interval, new_cells, next_kept, ranges_and_bounds
 from .dense import LANES
 from .exponential import exp, expm1, sigmoid
 from .grid_network import ask_network, network_of, room_of
-from .launch import BORROWS, kernel, launch, num_threads
+from .launch import BORROWS, array, kernel, launch, next_task, none_taken, num_threads
 from .rows import blend_rows, trailing_zeros
-from .tasks import next_task, none_taken
 
-NOWHERE = np.float32(np.nan)  # outside the lattice
 MOST = np.float32(MOST_LOG_DENSITY)
 LEFT_OUT, WHOLE, CUT, ELSEWHERE = 0, 1, 2, 3
 UNKNOWN = 4  # the line of values behind density and colours
@@ -37,58 +26,38 @@ ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
 def trace_network(
-    is_left: Tensor, rays: list[Tensor], tables: list[Tensor], cells: list[int], max_rows: int, weights: list[Tensor],
-    biases: list[Tensor], splits: int, scalars: list[float],
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    step, min_weight, split_weight, stop_transmittance = (np.float32(x) for x in scalars)
-    o, d, t0, t1 = (x.contiguous().numpy() for x in rays)
-    occupancy, skips, box, displacements, is_known, low, sides, field_low, scale, table, shifts = (
-        x.detach().contiguous() for x in tables
-    )
+    _: Tensor, rays: list[Tensor], tables: FrameTables, subdivision: int, scalars: list[float]
+) -> tuple[Tensor, Tensor]:
+    step, min_weight, subdivision_weight, stop_transmittance = (np.float32(x) for x in scalars)
+    o, d, t0, t1 = (array(x) for x in rays)
     states = rays[0].new_zeros(len(o), NUM_STATES)
     states[:, 0] = 1
-    is_done = ~is_left
-    shape, aabb, reach = tuple(occupancy.shape), box.numpy(), skips.numpy()
-    ranges, counts = np.empty((len(o), 3), o.dtype), np.empty(len(o), np.int64)
-    launch(ray_ranges, o, d, t0, t1, np.zeros_like(t0), aabb, step, ranges, counts)
-    bounds = np.empty((1, 3, 2), np.int64)
-    launch(block_bounds, reach[None], bounds)
-    network, widths = network_of(table, cells, max_rows, weights, biases)
+    is_done = torch.ones(len(o), dtype=torch.bool)
+    occupancy, aabb, reach = array(tables.occupancy), array(tables.aabb), array(tables.skips)
+    ranges, counts, bounds = ranges_and_bounds((o, d, t0, t1, np.zeros_like(t0)), aabb, step, reach[None])
+    weights, biases = ([x.bfloat16() for x in parameters] for parameters in (tables.weights, tables.biases))
+    network, widths = network_of(tables.table, tables.levels.cells, tables.levels.max_rows, weights, biases)
     workers, num_words = num_threads(), (int(counts.max(initial=0)) + TESTED_AT_ONCE) // 64 + 1
-    level = is_known.shape[2] - 1, is_known.shape[1] - 1, is_known.shape[0] - 1, 0, -1
+    displacements, shape = array(tables.displacements), tables.is_known.shape
+    level, columns = (shape[2] - 1, shape[1] - 1, shape[0] - 1, 0, -1), displacements.shape[1]
     launch(
-        _trace,
-        (o, d, t0, ranges, counts),
-        (occupancy.view(-1).numpy(), shape, reach, bounds[0], aabb, step),
-        (displacements.numpy(), level, low.numpy(), sides.numpy()),
-        (field_low.numpy(), scale.numpy(), shifts.numpy()),
-        network,
-        (splits, min_weight, split_weight, stop_transmittance),
-        states.numpy(),
-        is_done.numpy(),
-        _scratch(workers, splits, num_words, displacements.shape[1]),
-        room_of(weights, workers),
-        cell_tables(np.float32, workers),
-        none_taken(),
-        (0,) * displacements.shape[1],
-        *widths,
+        _trace, (o, d, t0, ranges, counts), (occupancy.ravel(), occupancy.shape, reach, bounds[0], aabb, step),
+        (displacements, level, array(tables.low), array(tables.sides)),
+        (array(tables.field_low), array(tables.field_scale), array(tables.shifts)), network,
+        (subdivision, min_weight, subdivision_weight, stop_transmittance), states.numpy(), is_done.numpy(),
+        _scratch(workers, subdivision, num_words, columns), room_of(weights, workers),
+        cell_tables(np.float32, workers), none_taken(), (0,) * columns, *widths,
     )  # fmt: skip
     return states, is_done
 
 
-def _scratch(workers: int, splits: int, num_words: int, num_moved: int) -> tuple[np.ndarray, ...]:
+def _scratch(workers: int, subdivision: int, num_words: int, num_moved: int) -> tuple[np.ndarray, ...]:
     """Each worker's, see `_trace`."""
-    return (
-        np.empty((workers, 2, PLACES), np.int64),
-        np.empty((workers, PLACES, num_words), np.uint64),
-        np.empty((workers, 2, PLACES), np.float32),
-        np.empty((workers, splits * PLACES), np.int64),
-        np.empty((workers, splits * PLACES), np.float32),
-        np.empty((workers, 5, PLACES), np.float32),
-        np.empty((workers, splits, 5, PLACES), np.float32),
-        np.empty((workers, num_moved + LINE), np.float32),
-        cells_of_workers(workers),
-    )
+    parts = subdivision * PLACES
+    shapes = (2, PLACES), (PLACES, num_words), (2, PLACES), (parts,), (parts,), (5, PLACES), (subdivision, 5, PLACES)
+    dtypes = np.int64, np.uint64, np.float32, np.int64, np.float32, np.float32, np.float32
+    tables = (np.empty((workers, *shape), dtype) for shape, dtype in zip(shapes, dtypes, strict=True))
+    return *tables, np.empty((workers, num_moved + LINE), np.float32), new_cells(workers)
 
 
 # No fast-math: intervals and cells must round like those of the definition.
@@ -105,16 +74,11 @@ def _trace(
     displacements, level, low, sides = lattice
     num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
     for worker in prange(len(room[0])):
-        numbers, kinds, kept, spans = (
-            scratch[0][worker, 0],
-            scratch[0][worker, 1],
-            scratch[1][worker],
-            scratch[2][worker],
-        )
-        owners, distances = scratch[3][worker], scratch[4][worker]  # of the places that are asked
-        values, part_values, moved, cells = (
-            scratch[5][worker], scratch[6][worker], scratch[7][worker], scratch[8][worker],
-        )  # fmt: skip
+        numbers, kinds = scratch[0][worker, 0], scratch[0][worker, 1]
+        kept, spans = scratch[1][worker], scratch[2][worker]
+        owners, distances = scratch[3][worker], scratch[4][worker]  # of the places that are evaluated
+        values, part_values = scratch[5][worker], scratch[6][worker]
+        moved, cells = scratch[7][worker], scratch[8][worker]
         asked = (
             (origins, directions, numbers, owners, distances),
             (displacements, level, low, sides, columns, moved),
@@ -159,22 +123,22 @@ def _choose(
     distances: Any,
 ) -> int:  # fmt: skip
     """Decide what becomes of intervals; where and of which ray parts of those are that are cut, and how many."""
-    splits, min_weight, split_weight, _ = options
+    subdivision, min_weight, subdivision_weight, _ = options
     num_parts = 0
     for s in range(active):
         if math.isnan(values[UNKNOWN, s]):
             kinds[s] = ELSEWHERE
             continue
         weight = states[numbers[s], 0] * -expm1(-values[0, s] * spans[1, s])
-        if splits == 1 or min_weight < weight <= split_weight:
+        if subdivision == 1 or min_weight < weight <= subdivision_weight:
             kinds[s] = WHOLE
         elif weight <= min_weight:
             kinds[s] = LEFT_OUT
         else:  # also NaN, which is seen
             kinds[s] = CUT
-            length = spans[1, s] / np.float32(splits)
-            for k in range(splits):
-                if 2 * k + 1 != splits:  # else its middle is the interval's
+            length = spans[1, s] / np.float32(subdivision)
+            for k in range(subdivision):
+                if 2 * k + 1 != subdivision:  # else its middle is the interval's
                     owners[num_parts], distances[num_parts] = s, _part(spans[0, s], k, length)
                     num_parts += 1
     return num_parts
@@ -182,7 +146,7 @@ def _choose(
 
 @njit(**BORROWS)
 def _composite(
-    active: int, numbers: Any, spans: Any, values: Any, part_values: Any, splits: int, kinds: Any, states: Any
+    active: int, numbers: Any, spans: Any, values: Any, part_values: Any, subdivision: int, kinds: Any, states: Any
 ) -> None:
     """Composite intervals and parts behind their rays' states; a ray of which a part is not known goes elsewhere."""
     part = 0
@@ -192,9 +156,9 @@ def _composite(
             _add(state, values, s, start + HALF * length, length)
         if kinds[s] != CUT:
             continue
-        length /= np.float32(splits)
-        for k in range(splits):
-            if 2 * k + 1 == splits:
+        length /= np.float32(subdivision)
+        for k in range(subdivision):
+            if 2 * k + 1 == subdivision:
                 _add(state, values, s, _part(start, k, length), length)
                 continue
             found, i = part_values[part // PLACES], part % PLACES
@@ -268,12 +232,7 @@ def _ask(count: int, first: int, asked: Any, values: Any) -> None:
         r, t = numbers[owners[first + i]], distances[first + i]
         for axis in range(3):
             places[axis, i] = values[1 + axis, i] = origins[r, axis] + t * directions[r, axis]
-    for axis in range(3):
-        line = places[axis]
-        for i in range(count):
-            share = (line[i] - low[axis]) / sides[axis]
-            line[i] = share if ZERO <= share <= ONE else NOWHERE
-    locate_all(places, count, level, rows, fractions)
+    locate_in_lattice(places, count, (level, low, sides), rows, fractions)
     for i in range(count):
         blend_rows(displacements, 0, rows_at(rows, i), fractions_at(fractions, i), moved, 0, columns)
         total = ZERO

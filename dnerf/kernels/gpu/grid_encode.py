@@ -15,60 +15,36 @@ PRIME_Y = tl.constexpr(HASH_PRIMES[1])
 PRIME_Z = tl.constexpr(HASH_PRIMES[2])
 
 
-def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    num_samples, num_features = positions.shape[0], table.shape[1]
-    levels = _levels(tuple(cells), max_rows, positions.device)
-    out = table.new_empty((num_samples, len(levels) * num_features))
+def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int, rounded: bool) -> Tensor:
+    num_samples, levels = len(positions), _levels(tuple(cells), max_rows, positions.device)
+    out = table.new_empty((num_samples, len(levels) * table.shape[1]))
     if num_samples:
-        _forward[triton.cdiv(num_samples, BLOCK), len(levels)](
-            positions.contiguous(),
-            table.contiguous(),
-            levels,
-            out,
-            num_samples,
-            num_features,
-            triton.next_power_of_2(num_features),
-            BLOCK,
-        )
-    return out
+        tensors = positions.contiguous(), table.contiguous(), levels, out
+        _forward[triton.cdiv(num_samples, BLOCK), len(levels)](*tensors, num_samples, *_widths(table))
+    return out.bfloat16() if rounded else out
 
 
 def grad_table(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    num_samples, num_features = positions.shape[0], table.shape[1]
-    levels = _levels(tuple(cells), max_rows, positions.device)
+    num_samples, levels = len(positions), _levels(tuple(cells), max_rows, positions.device)
     out = torch.zeros_like(table, memory_format=torch.contiguous_format)
     if num_samples:
-        _grad_table[triton.cdiv(num_samples, BLOCK), len(levels)](
-            grad.contiguous(),
-            positions.contiguous(),
-            levels,
-            out,
-            num_samples,
-            num_features,
-            triton.next_power_of_2(num_features),
-            BLOCK,
-        )
+        tensors = grad.contiguous(), positions.contiguous(), levels, out
+        _grad_table[triton.cdiv(num_samples, BLOCK), len(levels)](*tensors, num_samples, *_widths(table))
     return out
 
 
 def grad_positions(grad: Tensor, positions: Tensor, table: Tensor, cells: list[int], max_rows: int) -> Tensor:
-    num_samples, num_features = positions.shape[0], table.shape[1]
-    levels = _levels(tuple(cells), max_rows, positions.device)
+    num_samples, levels = len(positions), _levels(tuple(cells), max_rows, positions.device)
     out = torch.empty_like(positions, memory_format=torch.contiguous_format)
     if num_samples:
-        _grad_positions[(triton.cdiv(num_samples, BLOCK),)](
-            grad.contiguous(),
-            positions.contiguous(),
-            table.contiguous(),
-            levels,
-            out,
-            num_samples,
-            len(levels),
-            num_features,
-            triton.next_power_of_2(num_features),
-            BLOCK,
-        )
+        tensors = grad.contiguous(), positions.contiguous(), table.contiguous(), levels, out
+        _grad_positions[(triton.cdiv(num_samples, BLOCK),)](*tensors, num_samples, len(levels), *_widths(table))
     return out
+
+
+def _widths(table: Tensor) -> tuple[int, int, int]:
+    """Constants of the kernels: features of a row, the power of two that holds them, and samples of a program."""
+    return table.shape[1], triton.next_power_of_2(table.shape[1]), BLOCK
 
 
 @lru_cache(maxsize=64)
@@ -99,14 +75,7 @@ def _row(x, y, z, levels, level):
 
 @triton.jit
 def _forward(
-    positions,
-    table,
-    levels,
-    out,
-    num_samples,
-    num_features: tl.constexpr,
-    width: tl.constexpr,
-    block: tl.constexpr,
+    positions, table, levels, out, num_samples, num_features: tl.constexpr, width: tl.constexpr, block: tl.constexpr
 ):
     samples = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
     level, num_levels = tl.program_id(1), tl.num_programs(1)
@@ -128,14 +97,7 @@ def _forward(
 
 @triton.jit
 def _grad_table(
-    grad,
-    positions,
-    levels,
-    out,
-    num_samples,
-    num_features: tl.constexpr,
-    width: tl.constexpr,
-    block: tl.constexpr,
+    grad, positions, levels, out, num_samples, num_features: tl.constexpr, width: tl.constexpr, block: tl.constexpr
 ):
     samples = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
     level, num_levels = tl.program_id(1), tl.num_programs(1)
@@ -156,17 +118,9 @@ def _grad_table(
 
 @triton.jit
 def _grad_positions(
-    grad,
-    positions,
-    table,
-    levels,
-    out,
-    num_samples,
-    num_levels,
-    num_features: tl.constexpr,
-    width: tl.constexpr,
+    grad, positions, table, levels, out, num_samples, num_levels, num_features: tl.constexpr, width: tl.constexpr,
     block: tl.constexpr,
-):
+):  # fmt: skip
     samples = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
     features = tl.arange(0, width)
     valid = samples < num_samples

@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from dnerf.fixed_size import spread
+from dnerf.core.fixed_size import spread
 
 from ..march import interval_ranges
 
@@ -19,21 +19,11 @@ OPTIONS = {"num_warps": 1, "enable_fp_fusion": False}
 
 
 def march(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    occupancy: Tensor,
-    aabb: Tensor,
-    step: float,
-    max_samples_per_ray: int | None,
-    skips: Tensor | None,
+    occupancy: Tensor, rays: list[Tensor], aabb: Tensor, step: float, limit: int | None, skips: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    rays = [origins, directions, near, far, times, jitter]
+    near = rays[2]
     arguments = _arguments(rays, occupancy, aabb, near.new_full((1,), step))
-    limit = torch.iinfo(torch.int64).max if max_samples_per_ray is None else max_samples_per_ray
+    limit = torch.iinfo(torch.int64).max if limit is None else limit
     num_rays, offsets = len(near), torch.zeros(len(near) + 1, dtype=torch.int64, device=near.device)
     if num_rays:
         _march[(num_rays,)](*arguments, limit, offsets, near, near, offsets, *occupancy.shape, False, BLOCK, **OPTIONS)
@@ -69,18 +59,10 @@ def march_to_size(
 def _arguments(rays: list[Tensor], occupancy: Tensor, aabb: Tensor, step: Tensor) -> tuple[Tensor, ...]:
     """What the kernel reads, of origins, directions, near, far, times and jitter; `step` is (1,)."""
     origins, directions, near, far, times, jitter = rays
-    return (
-        origins.contiguous(),
-        directions.contiguous(),
-        near.contiguous(),
-        times.contiguous(),
-        jitter.contiguous(),
-        torch.stack((*interval_ranges(origins, directions, near, far, jitter, aabb, step),), -1),
-        occupancy.contiguous().view(torch.uint8),
-        aabb.contiguous(),
-        _shape(tuple(occupancy.shape[1:]), aabb.device, aabb.dtype) / (aabb[1] - aabb[0]),
-        step,
-    )
+    ranges = torch.stack(interval_ranges(origins, directions, near, far, jitter, aabb, step), -1)
+    scale = _shape(tuple(occupancy.shape[1:]), aabb.device, aabb.dtype) / (aabb[1] - aabb[0])
+    of_rays = (x.contiguous() for x in (origins, directions, near, times, jitter))
+    return *of_rays, ranges, occupancy.contiguous().view(torch.uint8), aabb.contiguous(), scale, step
 
 
 @lru_cache(maxsize=16)
@@ -90,16 +72,7 @@ def _shape(shape: tuple[int, ...], device: torch.device, dtype: torch.dtype) -> 
 
 
 @triton.jit
-def _cell(
-    origins,
-    directions,
-    aabb,
-    scale,
-    ray,
-    middle,
-    axis: tl.constexpr,
-    size: tl.constexpr,
-):
+def _cell(origins, directions, aabb, scale, ray, middle, axis: tl.constexpr, size: tl.constexpr):
     position = tl.load(origins + ray * 3 + axis) + tl.load(directions + ray * 3 + axis) * middle
     cell = (position - tl.load(aabb + axis)) * tl.load(scale + axis)
     return tl.minimum(tl.maximum(cell, 0.0), size - 1.0).to(tl.int64)
@@ -107,28 +80,10 @@ def _cell(
 
 @triton.jit
 def _march(
-    origins,
-    directions,
-    near,
-    times,
-    jitter,
-    ranges,
-    occupancy,
-    aabb,
-    scale,
-    step,
-    limit,
-    offsets,
-    starts,
-    ends,
-    ray_indices,
-    num_slabs: tl.constexpr,
-    nx: tl.constexpr,
-    ny: tl.constexpr,
-    nz: tl.constexpr,
-    fill: tl.constexpr,
+    origins, directions, near, times, jitter, ranges, occupancy, aabb, scale, step, limit, offsets, starts, ends,
+    ray_indices, num_slabs: tl.constexpr, nx: tl.constexpr, ny: tl.constexpr, nz: tl.constexpr, fill: tl.constexpr,
     block: tl.constexpr,
-):
+):  # fmt: skip
     """Count a ray's kept intervals into `offsets[ray + 1]`, or write them from `offsets[ray]` on."""
     ray = tl.program_id(0).to(tl.int64)
     near_, jitter_, step_ = tl.load(near + ray), tl.load(jitter + ray), tl.load(step)

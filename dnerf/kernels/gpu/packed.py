@@ -13,24 +13,18 @@ SUM_BLOCK = 32
 def weights(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     out = torch.empty_like(optical_depth, memory_format=torch.contiguous_format)
     if len(offsets) > 1 and len(optical_depth):
-        _weights[(len(offsets) - 1,)](
-            optical_depth.contiguous(), offsets.contiguous(), out, _terms(optical_depth), BLOCK, num_warps=2
-        )
+        tensors = optical_depth.contiguous(), offsets.contiguous(), out
+        # Terms of the series for 1 - exp(-x) that reach the dtype's precision at x = 1/2.
+        terms = 17 if optical_depth.dtype == torch.float64 else 9
+        _weights[(len(offsets) - 1,)](*tensors, terms, BLOCK, num_warps=2)
     return out
 
 
 def grad_optical_depth(grad: Tensor, optical_depth: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
     out = torch.empty_like(optical_depth, memory_format=torch.contiguous_format)
     if len(offsets) > 1 and len(optical_depth):
-        _grad_optical_depth[(len(offsets) - 1,)](
-            grad.contiguous(),
-            optical_depth.contiguous(),
-            weights,
-            offsets.contiguous(),
-            out,
-            BLOCK,
-            num_warps=2,
-        )
+        tensors = grad.contiguous(), optical_depth.contiguous(), weights, offsets.contiguous(), out
+        _grad_optical_depth[(len(offsets) - 1,)](*tensors, BLOCK, num_warps=2)
     return out
 
 
@@ -39,16 +33,8 @@ def sums(values: Tensor, weights: Tensor | None, offsets: Tensor) -> Tensor:
     out = values.new_zeros((num_rays, num_columns))
     if num_rays and values.numel():
         width = min(triton.next_power_of_2(num_columns), 64)
-        _sums[num_rays, triton.cdiv(num_columns, width)](
-            values.contiguous(),
-            values if weights is None else weights.contiguous(),
-            offsets.contiguous(),
-            out,
-            num_columns,
-            weights is not None,
-            SUM_BLOCK,
-            width,
-        )
+        tensors = values.contiguous(), values if weights is None else weights.contiguous(), offsets.contiguous(), out
+        _sums[num_rays, triton.cdiv(num_columns, width)](*tensors, num_columns, weights is not None, SUM_BLOCK, width)
     return out
 
 
@@ -59,11 +45,6 @@ def grad_values(grad: Tensor, weights: Tensor | None, offsets: Tensor, num_sampl
 
 def grad_weights(grad: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
     return (torch.repeat_interleave(grad, offsets.diff(), 0, output_size=len(values)) * values).sum(1)
-
-
-def _terms(tensor: Tensor) -> int:
-    """Terms of the series for 1 - exp(-x) that reach the dtype's precision at x = 1/2."""
-    return 17 if tensor.dtype == torch.float64 else 9
 
 
 @triton.jit
@@ -113,16 +94,7 @@ def _grad_optical_depth(grad, optical_depth, weights, offsets, out, block: tl.co
 
 
 @triton.jit
-def _sums(
-    values,
-    weights,
-    offsets,
-    out,
-    num_columns,
-    weighted: tl.constexpr,
-    block: tl.constexpr,
-    width: tl.constexpr,
-):
+def _sums(values, weights, offsets, out, num_columns, weighted: tl.constexpr, block: tl.constexpr, width: tl.constexpr):
     ray = tl.program_id(0)
     columns = tl.program_id(1) * width + tl.arange(0, width)
     start, last = tl.load(offsets + ray), tl.load(offsets + ray + 1)

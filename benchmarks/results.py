@@ -1,0 +1,139 @@
+"""One page of all results, from the reports that suites have written."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.kernel_cases import COMPILED, PLAIN, REFERENCE
+from benchmarks.report import markdown_table
+from benchmarks.suite import Row
+
+HEAD = """# Results
+
+This page is a reference. `python scripts/results.py` makes it from the reports in {folder}; edit neither.
+Below each table stand the commands that made its reports, with date and commit.
+Compare times within one report only: machines, and hours of one machine, differ.
+A dash is what a report does not say; a dagger after a commit points to a note beside the command.
+"""
+
+
+def results_page(folder: Path) -> str:
+    """The page's text, in Markdown.
+
+    Args:
+        folder: of the reports, one folder with a `results.json` for each; links to them are relative to its parent.
+
+    Raises:
+        ValueError: for a folder without reports, or naming a file that is none.
+    """
+    reports = {path.parent.name: _read(path) for path in sorted(folder.glob("*/results.json"))}
+    if not reports:
+        raise ValueError(f"reports must be a folder with */results.json, found none in {folder}")
+    parts = [HEAD.format(folder=f"[{folder.name}/]({folder.name}/)")]
+    left = dict(reports)
+    for title, table, note, rows_of in SECTIONS:
+        own = {name: report for name, report in reports.items() if table in report["tables"]}
+        rows = [
+            {"report": _link(folder, name), **row, "hardware": report["machine"]["hardware"], "commit": _commit(report)}
+            for name, report in own.items()
+            for row in rows_of(report["tables"][table])
+        ]
+        if rows:
+            parts += [f"## {title}\n", note + "\n", *markdown_table(rows), "", _commands(own)]
+        left = {name: report for name, report in left.items() if name not in own}
+    if left:
+        rows = [{"report": _link(folder, name), "what": report["title"]} for name, report in left.items()]
+        parts += ["## Other reports\n", *markdown_table(rows), "", _commands(left)]
+    return "\n".join(parts)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not a readable JSON file ({error})") from error
+    if not isinstance(report, dict) or not {"title", "command", "date", "machine", "tables"} <= report.keys():
+        raise ValueError(f"{path}: expected a report of scripts/benchmark.py")
+    return report
+
+
+def _link(folder: Path, name: str) -> str:
+    return f"[{name}]({folder.name}/{name}/report.md)"
+
+
+def _commit(report: Mapping[str, Any]) -> str:
+    return report["machine"]["commit"] + (" †" if "note" in report else "")
+
+
+def _commands(reports: Mapping[str, Mapping[str, Any]]) -> str:
+    lines = []
+    for name, report in reports.items():
+        note = f": {report['note']}" if "note" in report else ""
+        lines += [f"# {name}: {report['date'][:10]}, commit {_commit(report)}{note}", report["command"]]
+    return "\n".join(["```sh", *lines, "```", ""])
+
+
+def _quality(rows: list[Row]) -> Iterator[Row]:
+    for row in rows:
+        is_one = row["seeds"] == 1
+        yield {
+            **{name: row[name] for name in ("scene", "split", "experiment")},
+            "pixels": row.get("resolution"),
+            "seconds": row["budget_s"],
+            "seeds": row["seeds"],
+            "PSNR": f"{row['psnr']:.2f}" + ("" if is_one else f" [{row['psnr_low']:.2f}, {row['psnr_high']:.2f}]"),
+            "SSIM": f"{row['ssim']:.3f}",
+            "steps": row["steps"],
+            "frame s": row["frame_s"],
+            "model MiB": row.get("model_MiB"),
+        }
+
+
+def _frames(rows: list[Row]) -> Iterator[Row]:
+    """What every run takes with its own settings, which come first."""
+    known = set()
+    for row in rows:
+        if (row["run"], row["size"]) not in known:
+            known.add((row["run"], row["size"]))
+            yield {
+                **{name: row[name] for name in ("run", "size")},
+                "PSNR": None if row["psnr"] is None else f"{row['psnr']:.2f}",
+                **{name: row[name] for name in ("median_ms", "low_ms", "high_ms", "frames_per_second")},
+                "model MiB": row.get("model_MiB"),
+            }
+
+
+def _kernels(rows: list[Row]) -> Iterator[Row]:
+    """Every kernel on the most samples and threads."""
+    most = max(row["samples"] for row in rows), max(row["threads"] for row in rows)
+    chosen = [row for row in rows if (row["samples"], row["threads"]) == most]
+    for kernel, direction in dict.fromkeys((row["kernel"], row["direction"]) for row in chosen):
+        found = {r["variant"]: r for r in chosen if (r["kernel"], r["direction"]) == (kernel, direction)}
+        yield {
+            "kernel": kernel,
+            "direction": direction,
+            "samples": most[0],
+            "compiled ms": found[COMPILED]["median_ms"],
+            "times its least traffic": found[COMPILED]["times_limit"],
+            **{f"{name}, times": found.get(name, {}).get("times_compiled") for name in (REFERENCE, PLAIN)},
+        }
+
+
+SECTIONS: tuple[tuple[str, str, str, Callable[[list[Row]], Iterator[Row]]], ...] = (
+    (
+        "Quality after seconds of training",
+        "means_over_seeds",
+        "Held-out frames; with several seeds their mean and, in brackets, worst and best. `model MiB` is the size of "
+        "the weights file. D-NeRF's Lego is scored on `val`: its test split shows another pose than its train split.",
+        _quality,
+    ),
+    ("Frames", "frames", "Each frame alone, in evaluation mode: median and quartiles of the time.", _frames),
+    (
+        "Kernels",
+        "times",
+        "The compiled version, and how many times as long its definition and the best plain torch take.",
+        _kernels,
+    ),
+)
+"""Title, table of the reports, note, and what is taken from that table."""

@@ -1,0 +1,1 @@
+"""Rays, samples, cameras, compositing: what every part exchanges."""

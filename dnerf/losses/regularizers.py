@@ -1,0 +1,192 @@
+"""Terms about the field rather than the image: unseen space, roughness of volumes and of time embeddings."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.core.checks import as_box, check_positive
+from dnerf.core.compositing import Rendering
+from dnerf.core.schedules import Schedule
+from dnerf.fields import SpaceTimeVolumes
+from dnerf.losses.base import Batch, Loss
+from dnerf.losses.deformation import deformed
+from dnerf.nn.encodings import TimeEncoding
+from dnerf.rendering.renderer import Renderer
+from dnerf.samplers import OccupancyAware
+
+VISIBLE_WEIGHT = 1e-3  # share in an image from which a sample counts as seen
+PLASTIC = 1.1347241384015194
+
+
+class UnseenSpaceLoss(Loss):
+    """Opacity in canonical space that no ray sees, at random places in occupied cells.
+
+    A field invents floaters where no training ray reaches (below the ground, inside bodies), and views from elsewhere
+    show it. What rays see is left alone: a cell of canonical space in which a sample had a share in an image within
+    the last `memory_samples` samples costs nothing. Inside opaque bodies there is no gradient,
+    `1 - exp(-density length)` is flat there; none reaches the deformation.
+
+    Source: a sparsity prior as of Plenoxels (arXiv 2112.05131) eq. 5, restricted to what is unseen, with NeRF's opacity
+    (eq. 3) for their Cauchy logarithm.
+
+    Args:
+        box: (2, 3) corners of the canonical space that is kept account of, in world units; the sampler's if None.
+        weight: factor of the mean opacity.
+        num_points: places of each step.
+        every: steps between its turns, see `Loss`.
+        length: of the intervals, in world units.
+        resolution: cells along each side of the box.
+        memory_samples: of the batches it is called with, after which a cell that had no share in an image counts as
+            unseen. (As many calls would mean more with larger batches.)
+
+    Raises:
+        ValueError: for numbers that are not positive, or a negative weight.
+    """
+
+    def __init__(
+        self, box: Sequence[Sequence[float]] | None = None, weight: float | Schedule = 1e-2, num_points: int = 1024, *,
+        every: int = 4, length: float = 0.02, resolution: int = 64, memory_samples: int = 1 << 20,
+    ) -> None:  # fmt: skip
+        super().__init__(weight, every=every)
+        for name, value in (
+            ("num_points", num_points), ("length", length), ("resolution", resolution),
+            ("memory_samples", memory_samples),
+        ):  # fmt: skip
+            check_positive(name, value)
+        self.num_points = num_points
+        self.length = length
+        self.memory_samples = memory_samples
+        self.takes_box = box is None
+        self.box = nn.Buffer(torch.zeros(2, 3) if box is None else as_box(box), persistent=False)
+        self.num_calls = nn.Buffer(torch.zeros((), dtype=torch.int64))
+        self.num_samples = nn.Buffer(torch.zeros((), dtype=torch.int64))
+        self.last_seen = nn.Buffer(torch.full((resolution,) * 3, -memory_samples - 1, dtype=torch.int64))
+        # Kronecker's sequence in five dimensions: powers of the root of x^6 = x + 1 (Roberts 2018).
+        powers = torch.arange(1, 6, dtype=torch.float64)
+        self.generators = nn.Buffer(PLASTIC**-powers, persistent=False)
+
+    def check(self, model: Renderer) -> None:
+        """Needs a deformed field, and a sampler that knows which cells are occupied, whose box it may take."""
+        deformed(model, self)
+        if not isinstance(model.sampler, OccupancyAware):
+            raise ValueError(f"UnseenSpaceLoss needs an occupancy-aware sampler, got {type(model.sampler).__name__}")
+        if self.takes_box:
+            self.box = nn.Buffer(model.sampler.occupied_cells(None).box.clone(), persistent=False)
+
+    def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
+        """Mean opacity; other places at every call, evenly spread over many of them."""
+        field, sampler = deformed(model, self), model.sampler
+        assert isinstance(sampler, OccupancyAware)
+        assert rendering.output is not None
+        assert rendering.weights is not None
+        self.to(rendering.rgb.device)
+        self.num_calls.add_(1)
+        self.num_samples.add_(rendering.weights.numel())
+        # Nothing here waits for a device: which samples are seen, and how many, is known there only.
+        seen = torch.where(rendering.weights > VISIBLE_WEIGHT, self.num_samples, torch.iinfo(torch.int64).min)
+        cells = self._cells(rendering.output.extras["canonical_positions"].detach())
+        self.last_seen.view(-1).scatter_reduce_(0, cells.reshape(-1), seen.reshape(-1), "amax")
+        number = self.num_calls * self.num_points + torch.arange(self.num_points, device=seen.device)
+        unit = (number[:, None] * self.generators % 1).to(rendering.rgb.dtype)
+        places = sampler.occupied_positions(unit.clamp(max=1 - torch.finfo(unit.dtype).eps))
+        with torch.no_grad(), model.autocast(seen.device):
+            canonical = field.deformation(*places)
+        is_unseen = self.num_samples - self.last_seen.view(-1)[self._cells(canonical)] > self.memory_samples
+        with model.autocast(seen.device):
+            density = field.canonical.density(canonical, places[1])
+        return (is_unseen * -torch.expm1(-self.length * density)).mean()
+
+    def _cells(self, positions: Tensor) -> Tensor:
+        """Numbers (N,) of the cells of positions (N, 3); outside the box, of the nearest."""
+        size = self.last_seen.shape[0]
+        unit = (positions - self.box[0]) / (self.box[1] - self.box[0])
+        x, y, z = (unit * size).long().clamp(0, size - 1).unbind(-1)
+        return (x * size + y) * size + z
+
+
+class SpaceTimeSmoothnessLoss(Loss):
+    """Roughness of space-time volumes: each time is seen from one side, and neighbouring times are alike.
+
+    Squared differences of neighbours in space and second differences in time, means over each table: what moves evenly
+    costs nothing in time, so that what one image leaves open is as in those before and after.
+
+    Source: K-Planes (arXiv 2301.10241) section 3.2, total variation in space and smoothness in time.
+
+    Args:
+        weight, every: see `Loss`.
+        time_weight: factor of the differences in time to those in space.
+
+    Raises:
+        ValueError: for a negative weight.
+    """
+
+    def __init__(self, weight: float | Schedule = 1e-2, *, time_weight: float = 1.0, every: int = 4) -> None:
+        super().__init__(weight, every=every)
+        check_positive("time_weight", time_weight, allow_zero=True)
+        self.time_weight = time_weight
+
+    def check(self, model: Renderer) -> None:
+        """Needs space-time volumes."""
+        if not self._parts(model):
+            raise ValueError("SpaceTimeSmoothnessLoss needs a field with space-time volumes, this one has none")
+
+    def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
+        """Roughness in space, plus that in time times its factor."""
+        total = rendering.rgb.new_zeros(())
+        for part in self._parts(model):
+            in_space, in_time = part.roughness()
+            total = total + in_space + self.time_weight * in_time
+        return total
+
+    def _parts(self, model: Renderer) -> list[SpaceTimeVolumes]:
+        return [part for part in model.field.modules() if isinstance(part, SpaceTimeVolumes)]
+
+
+class TimeEmbeddingLoss(Loss):
+    """Roughness of learnt time embeddings, see `TimeEncoding`: squared differences of neighbours.
+
+    Embeddings that lie between two frames learn nothing from images; with this they are between their neighbours, and
+    after the last frame they are as the last one that was seen. Each time is seen by few cameras, often by one, and
+    in a long training motion may be bent to that one. So the weight grows in proportion to the rays, from a number of
+    them for each embedding on.
+
+    Args:
+        weight, every: see `Loss`.
+        rays_per_embedding: of the batches it is called with, for each embedding in use, from which on the weight grows;
+            None for a weight that stays.
+
+    Raises:
+        ValueError: for a negative weight, or a number of rays that is not positive.
+    """
+
+    def __init__(
+        self, weight: float | Schedule = 1e-3, *, rays_per_embedding: int | None = 5_000, every: int = 4
+    ) -> None:
+        super().__init__(weight, every=every)
+        if rays_per_embedding is not None:
+            check_positive("rays_per_embedding", rays_per_embedding)
+        self.rays_per_embedding = rays_per_embedding
+        self.num_rays = nn.Buffer(torch.zeros((), dtype=torch.int64))
+
+    def check(self, model: Renderer) -> None:
+        """Needs learnt time embeddings."""
+        if not self._parts(model):
+            raise ValueError("TimeEmbeddingLoss needs learnt time embeddings, this model has none")
+
+    def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
+        """Mean squared differences; of the rendering only the number of rays matters."""
+        total = rendering.rgb.new_zeros(())
+        self.to(rendering.rgb.device)
+        self.num_rays.add_(len(rendering.rgb))  # a tensor: graphs that replay steps go on counting
+        for part in self._parts(model):
+            total = total + self._growth(part) * part.roughness()
+        return total
+
+    def _parts(self, model: Renderer) -> list[TimeEncoding]:
+        return [p for p in model.field.modules() if isinstance(p, TimeEncoding) and p.embeddings is not None]
+
+    def _growth(self, encoding: TimeEncoding) -> Tensor | float:
+        if self.rays_per_embedding is None:
+            return 1.0
+        return (self.num_rays / (self.rays_per_embedding * encoding.num_used)).clamp(min=1)

@@ -1,0 +1,1 @@
+"""Small networks and encodings that fields and deformations share."""

@@ -1,0 +1,202 @@
+"""Fixed encodings of positions, times and directions."""
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from dnerf.core.checks import check_choice, check_positive, check_whole
+from dnerf.core.geometry import check_last_axis
+from dnerf.core.schedules import Scheduled
+
+FRAMES_PER_EMBEDDING = 2
+
+
+class FrameTimesAware(ABC):
+    """A module that gets to know the times of the training frames before the first step."""
+
+    @abstractmethod
+    def see(self, times: Tensor) -> None:
+        """Adapt to the times (F,) of the frames; what was learnt before stays."""
+
+
+class SinusoidalEncoding(nn.Module, Scheduled):
+    """Sines and cosines of a value at doubling frequencies: (x, sin(2^k x), cos(2^k x)), k < num_frequencies.
+
+    Source: NeRF (arXiv 2003.08934) eq. 4, without its factor pi, as D-NeRF's code has it. With
+    `window_end`, frequency k fades in while training goes on (Nerfies, arXiv 2011.12948, eq. 8):
+    w_k = (1 - cos(pi clamp(a - k, 0, 1))) / 2 with a = num_frequencies * progress / window_end.
+
+    Args:
+        num_dims: D, size of the last axis of the input.
+        num_frequencies: number of octaves, >= 0.
+        include_input: whether the value itself comes first.
+        window_end: fraction of the training, in (0, 1], at which every frequency is fully in; None for no window.
+
+    Raises:
+        ValueError: for an encoding of size zero or a window outside (0, 1].
+    """
+
+    def __init__(
+        self, num_dims: int, num_frequencies: int, include_input: bool = True, *, window_end: float | None = None
+    ) -> None:
+        super().__init__()
+        check_positive("num_dims", num_dims)
+        check_positive("num_frequencies", num_frequencies, allow_zero=include_input)
+        if window_end is not None and not 0 < window_end <= 1:
+            raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
+        self.num_dims = num_dims
+        self.num_frequencies = num_frequencies
+        self.include_input = include_input
+        self.window_end = window_end
+        self.out_features = num_dims * (2 * num_frequencies + include_input)
+        self.frequencies = nn.Buffer(2.0 ** torch.arange(num_frequencies), persistent=False)
+        weights = torch.zeros(num_frequencies) if window_end is not None else torch.ones(num_frequencies)
+        self.window = nn.Buffer(weights, persistent=window_end is not None)
+
+    def set_progress(self, progress: float) -> None:
+        """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
+        if self.window_end is None:
+            return
+        alpha = self.num_frequencies * min(progress / self.window_end, 1.0)
+        octaves = torch.arange(self.num_frequencies, device=self.window.device)
+        self.window.copy_(0.5 * (1 - torch.cos(math.pi * (alpha - octaves).clamp(0, 1))))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Encode (..., D) -> (..., D * (2 * num_frequencies + include_input)), in the input's dtype."""
+        return torch.cat(self.parts(values), dim=-1)
+
+    def parts(self, values: Tensor) -> list[Tensor]:
+        """What `forward` puts together, for callers who put more together in one go."""
+        check_last_axis("values", values, self.num_dims)
+        angles = (values[..., None, :] * self.frequencies.to(values.dtype)[:, None]).flatten(-2)
+        waves = [torch.sin(angles), torch.cos(angles)]
+        if self.window_end is not None:
+            window = self.window.to(values.dtype).repeat_interleave(self.num_dims)
+            waves = [wave * window for wave in waves]
+        return [values, *waves] if self.include_input else waves
+
+
+class TimeEncoding(nn.Module, FrameTimesAware):
+    """Waves of a time, then a learnt time embedding: features evenly spaced in time, linear in between.
+
+    Waves (`SinusoidalEncoding`) are smooth and say something of all times. What happens within a frame or two, as when
+    a ball bounces, a network finds in them slowly, and more octaves ripple everywhere. An embedding is of its own time
+    alone. Embeddings begin at zero and stay there at times that no frame has, if no loss says otherwise
+    (`dnerf.losses.TimeEmbeddingLoss`). How many are in use depends on how many frames there are (`see`): a frame with
+    an embedding of its own is explained by bending it by itself, not by what other frames show, too.
+
+    Source: the latent codes of frames in Nerfies (arXiv 2011.12948) and DyNeRF (arXiv 2103.02597), here beside waves
+    and defined between frames, too.
+
+    Args:
+        num_frequencies: octaves of the waves, >= 0.
+        num_embeddings: K, from time 0 to time 1, all in use until `see` says otherwise; 0 for none, else at least 2.
+        num_features: F of an embedding.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(self, num_frequencies: int, num_embeddings: int = 0, num_features: int = 4) -> None:
+        super().__init__()
+        if num_embeddings < 0 or num_embeddings == 1:
+            raise ValueError(f"num_embeddings must be 0 or at least 2, got {num_embeddings}")
+        check_whole("num_embeddings", num_embeddings, allow_zero=True)
+        check_positive("num_features", num_features)
+        self.waves = SinusoidalEncoding(1, num_frequencies)
+        self.embeddings = nn.Parameter(torch.zeros(num_embeddings, num_features)) if num_embeddings else None
+        if num_embeddings:
+            self.num_used = nn.Buffer(torch.tensor(num_embeddings))
+        self.out_features = self.waves.out_features + (num_features if num_embeddings else 0)
+
+    @torch.no_grad()
+    def see(self, times: Tensor) -> None:
+        """Use half as many embeddings as there are frames, and at most one for each time; what they know stays.
+
+        Args:
+            times: (F,) of the frames that training has.
+        """
+        if self.embeddings is None:
+            return
+        wanted = min(len(times) // FRAMES_PER_EMBEDDING, len(times.unique()), len(self.embeddings))
+        has_learnt = bool(self.embeddings.any())
+        wanted = max(wanted, int(self.num_used) if has_learnt else 2, 2)
+        if wanted != self.num_used:
+            places = torch.linspace(0, 1, wanted, dtype=self.embeddings.dtype, device=self.embeddings.device)
+            features = self._features(self.embeddings, places[:, None])
+            self.num_used.fill_(wanted)
+            self.embeddings[:wanted] = features
+
+    def forward(self, times: Tensor) -> Tensor:
+        """Encode times (..., 1) -> (..., 2 num_frequencies + 1 + F), in their dtype; those outside [0, 1] see its ends'
+        features."""
+        return torch.cat(self.parts(times), dim=-1)
+
+    def parts(self, times: Tensor) -> list[Tensor]:
+        """What `forward` puts together, for callers who put more together in one go."""
+        waves = self.waves.parts(times)
+        return waves if self.embeddings is None else [*waves, self._features(self.embeddings, times)]
+
+    def roughness(self) -> Tensor:
+        """The mean squared difference () between features of neighbouring embeddings in use; 0 without embeddings."""
+        if self.embeddings is None:
+            return self.waves.frequencies.new_zeros(())
+        last = self.num_used - 1
+        is_used = torch.arange(len(self.embeddings) - 1, device=last.device) < last
+        return self.embeddings.diff(dim=0).square().mean(dim=1).mul(is_used).sum() / last
+
+    def _features(self, embeddings: Tensor, times: Tensor) -> Tensor:
+        last = self.num_used - 1
+        places = times.clamp(0, 1) * last.to(times.dtype)
+        # Of NaN: some embedding, and a share that is NaN.
+        lower = torch.minimum(places.detach().long().clamp_(min=0), last - 1)
+        before, after = (embeddings.index_select(0, (lower + i).flatten()) for i in (0, 1))
+        shape = (*times.shape[:-1], embeddings.shape[1])
+        return torch.lerp(before.view(shape).to(times.dtype), after.view(shape).to(times.dtype), places - lower)
+
+
+class SphericalHarmonicsEncoding(nn.Module):
+    """Real spherical harmonics of a unit direction up to a degree: (degree + 1)^2 numbers.
+
+    Source: Sloan, "Efficient Spherical Harmonic Evaluation" (JCGT 2013); orthonormal on the sphere, with the
+    signs of the usual graphics convention (Condon-Shortley phase included).
+
+    Args:
+        degree: 0 to 3.
+
+    Raises:
+        ValueError: for another degree.
+    """
+
+    def __init__(self, degree: int = 3) -> None:
+        super().__init__()
+        check_choice("degree", degree, (0, 1, 2, 3))
+        self.degree = degree
+        self.out_features = (degree + 1) ** 2
+
+    def forward(self, directions: Tensor) -> Tensor:
+        """Encode unit directions (..., 3) -> (..., (degree + 1)^2)."""
+        check_last_axis("directions", directions, 3)
+        x, y, z = directions.unbind(-1)
+        terms = [torch.full_like(x, 0.5 * math.sqrt(1 / math.pi))]
+        if self.degree >= 1:
+            c = math.sqrt(3 / (4 * math.pi))
+            terms += [-c * y, c * z, -c * x]
+        if self.degree >= 2:
+            c = math.sqrt(15 / math.pi)
+            xx, yy, zz = x * x, y * y, z * z
+            terms += [
+                c / 2 * x * y, -c / 2 * y * z, math.sqrt(5 / math.pi) / 4 * (2 * zz - xx - yy), -c / 2 * x * z,
+                c / 4 * (xx - yy),
+            ]  # fmt: skip
+        if self.degree >= 3:
+            a, b = math.sqrt(35 / (2 * math.pi)) / 4, math.sqrt(21 / (2 * math.pi)) / 4
+            c, d = math.sqrt(105 / math.pi) / 4, math.sqrt(7 / math.pi) / 4
+            terms += [
+                -a * y * (3 * xx - yy), 2 * c * x * y * z, -b * y * (4 * zz - xx - yy),
+                d * z * (2 * zz - 3 * xx - 3 * yy), -b * x * (4 * zz - xx - yy), c * z * (xx - yy),
+                -a * x * (xx - 3 * yy),
+            ]  # fmt: skip
+        return torch.stack(terms, dim=-1)

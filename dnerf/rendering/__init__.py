@@ -1,0 +1,5 @@
+"""From a field to images: what is trained, and how whole images are made."""
+
+from dnerf.rendering.renderer import Renderer
+
+__all__ = ["Renderer"]

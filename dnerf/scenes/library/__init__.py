@@ -1,0 +1,1 @@
+"""The exact scenes by name."""

@@ -1,0 +1,16 @@
+"""Training a renderer on frames."""
+
+from dnerf.training.callbacks import BoxWarning, Callback, ProgressBar
+from dnerf.training.checkpoint_folder import CheckpointFolder, Checkpoints
+from dnerf.training.logging import JsonLinesLog, Previews, TensorBoardLog
+from dnerf.training.optimizer import AdamMuon, AdamSettings
+from dnerf.training.records import TrainingRecord
+from dnerf.training.recovery import Recovery
+from dnerf.training.run import Run
+from dnerf.training.signals import TrainingStopped
+from dnerf.training.trainer import Trainer
+
+__all__ = [
+    "AdamMuon", "AdamSettings", "BoxWarning", "Callback", "CheckpointFolder", "Checkpoints", "JsonLinesLog", "Previews",
+    "ProgressBar", "Recovery", "Run", "TensorBoardLog", "Trainer", "TrainingRecord", "TrainingStopped",
+]  # fmt: skip

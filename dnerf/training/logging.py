@@ -1,0 +1,131 @@
+"""Logs of a training run: JSON lines, preview images, TensorBoard."""
+
+import errno
+import json
+import math
+import os
+from typing import Any
+
+from dnerf.core.checks import check_whole
+from dnerf.core.files import write_text
+from dnerf.data.source import DataSource
+from dnerf.evaluation.scores import evaluate
+from dnerf.training.callbacks import Callback
+from dnerf.training.run import Run
+from dnerf.visualization.video import comparison_sheet, write_png
+
+
+class JsonLinesLog(Callback):
+    """Appends every training record to a file in the run's folder, one JSON object a line, flushed at once.
+
+    The first record of a continued run replaces those of the same step and later ones, which an earlier process
+    wrote after its last checkpoint. No line is left half written.
+    """
+
+    _is_trimmed = False
+
+    def __init__(self, name: str = "log.jsonl") -> None:
+        self.name = name
+
+    def on_train_begin(self, run: Run) -> None:
+        """Make the folder; the file is trimmed before the first record."""
+        run.folder_for(self).mkdir(parents=True, exist_ok=True)
+        self._is_trimmed = False
+
+    def on_step_end(self, run: Run) -> None:
+        """Append a record."""
+        if run.record is None or not run.processes.is_first:
+            return
+        path = run.folder_for(self) / self.name
+        if not self._is_trimmed and path.exists():
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+            write_text(path, "".join(f"{line}\n" for line in lines if _step_of(line) < run.record.step))
+        self._is_trimmed = True
+        line = (json.dumps({**vars(run.record), "losses": dict(run.record.losses)}) + "\n").encode()
+        with path.open("ab", buffering=0) as file:
+            size = file.seek(0, os.SEEK_END)
+            try:
+                if file.write(line) != len(line):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+            except OSError:
+                file.truncate(size)
+                raise
+
+
+def _step_of(line: str) -> float:
+    """The step of a line; infinite if the line is broken."""
+    try:
+        return float(json.loads(line)["step"])
+    except (ValueError, KeyError, TypeError):
+        return math.inf
+
+
+class Previews(Callback):
+    """Writes *prediction | truth | error* of the middle frame of a split every so many steps.
+
+    Raises:
+        ValueError: if `every` is not positive, or the data have no such split.
+    """
+
+    def __init__(self, data: DataSource, every: int = 500, split: str = "val") -> None:
+        check_whole("every", every)
+        data.check(split)
+        self.data, self.every, self.split = data, every, split
+
+    def on_train_begin(self, run: Run) -> None:
+        """Read the frame; a continued run goes on after the images that are there."""
+        self._folder = run.folder_for(self) / "previews"
+        if run.processes.is_first:
+            frames = self.data.frames(self.split)
+            self._frame = frames.subset([len(frames) // 2])
+        steps = [int(path.stem.partition("_")[2]) for path in self._folder.glob("step_*.png")]
+        self._next = max(steps, default=0) + self.every
+
+    def on_step_end(self, run: Run) -> None:
+        """Render the preview at the first record after `every` steps."""
+        if run.record is None or run.step < self._next or not run.processes.is_first:
+            return
+        self._next = run.step + self.every
+        scores: list[Any] = []
+        evaluate(run.renderer, self._frame, on_frame=lambda *score: scores.append(score))
+        score, prediction, truth = scores[0]
+        sheet = comparison_sheet([(prediction, truth)], [f"step {run.step}: {score.psnr:.2f} dB"])
+        write_png(sheet, self._folder / f"step_{run.step:07d}.png")
+
+
+class TensorBoardLog(Callback):
+    """Writes every training record's numbers as TensorBoard scalars into `tensorboard/` of the run's folder.
+
+    Raises:
+        ValueError: if the extra "tensorboard" is not installed.
+    """
+
+    _writer: Any = None
+
+    def __init__(self) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise ValueError("TensorBoardLog needs the extra: pip install 'dnerf[tensorboard]'") from error
+        self._make = SummaryWriter
+
+    def on_train_begin(self, run: Run) -> None:
+        """Open the files."""
+        folder = str(run.folder_for(self) / "tensorboard")
+        self._writer = self._make(folder) if run.processes.is_first else None
+
+    def on_step_end(self, run: Run) -> None:
+        """Write a record."""
+        record = run.record
+        if record is None or self._writer is None:
+            return
+        sizes = {"rays_per_step": record.num_rays, "samples_per_step": record.num_samples}
+        losses = {f"loss/{name}": value for name, value in record.losses.items()}
+        for name, value in {**losses, "psnr": record.psnr, **sizes}.items():
+            self._writer.add_scalar(name, value, record.step)
+        self._writer.flush()
+
+    def on_train_end(self, run: Run) -> None:
+        """Close the files."""
+        if self._writer is not None:
+            self._writer.close()

@@ -1,0 +1,119 @@
+"""Plain Python for what `conf/experiment/fast.yaml` composes: a model, its trainer, and frames to train on."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from dnerf.core.backgrounds import Background, RandomBackground
+from dnerf.core.checks import as_box
+from dnerf.core.schedules import Ramp
+from dnerf.data.frames import Frames
+from dnerf.data.pixel_samplers import ErrorGuidedPixels, TemporalCurriculum
+from dnerf.data.source import BlenderData
+from dnerf.deformations import AlongRaysDeformation, CachedDeformation, Deformation, DisplacementDeformation
+from dnerf.fields import DeformedField, GridField, RadianceField
+from dnerf.losses import AppearanceConstancyLoss, ElasticLoss, PhotometricLoss, TimeEmbeddingLoss, UnseenSpaceLoss
+from dnerf.rendering.renderer import Renderer
+from dnerf.samplers import OccupancyGrid, OccupancySampler
+from dnerf.training.callbacks import Callback, ProgressBar
+from dnerf.training.optimizer import AdamSettings
+from dnerf.training.recovery import Recovery
+from dnerf.training.trainer import Trainer
+
+Corners = Tensor | Sequence[Sequence[float]]
+
+
+def load_dataset(path: str | Path, split: str = "train", resolution: int | None = 400) -> Frames:
+    """Frames of a data set's folder in D-NeRF's format.
+
+    Args:
+        path: of the folder that holds `transforms_<split>.json`.
+        split: "train", "val" or "test".
+        resolution: width in pixels after area averaging; None keeps the files' size.
+
+    Raises:
+        ValueError: naming the file that is missing or broken.
+    """
+    return BlenderData(str(path), resolution).frames(split)
+
+
+def make_renderer(
+    box: Corners,
+    *,
+    deformation: Deformation | None = None,
+    field: RadianceField | None = None,
+    background: Background | None = None,
+) -> Renderer:
+    """The model of `experiment=fast`: a small displacement network into a multi-resolution grid.
+
+    Args:
+        box: (2, 3) corners of what is modelled, in world units, see `fit_box`.
+        deformation: world -> canonical, in place of the displacement network.
+        field: canonical, in place of the grid.
+        background: random in training, white in images if None, which needs frames with alpha.
+
+    Raises:
+        ValueError: for a box that is none.
+    """
+    corners = as_box(box).tolist()
+    if deformation is None:
+        deformation = DisplacementDeformation(
+            4, 128, position_frequencies=3, time_frequencies=5, canonical_time=None, time_embeddings=100
+        )
+    if field is None:
+        field = GridField(corners, (16, 32, 64, 128, 256), temporal_terms=4, window_end=0.3)
+    along_rays = AlongRaysDeformation(deformation, 0.06)
+    sampler = OccupancySampler(
+        OccupancyGrid(corners, 64, decay=0.6, render_dilation=0),
+        Ramp(0.04, 0.028, end=0.5, kind="exponential"),
+        subdivision=2, render_subdivision=3, subdivision_weight=0.02, narrow_from=0.3, min_weight=1e-4, filter_joins=2,
+    )  # fmt: skip
+    return Renderer(
+        DeformedField(CachedDeformation(along_rays, corners, 80), field),
+        sampler,
+        RandomBackground("white") if background is None else background,
+        precision="bfloat16",
+        stop_transmittance=4e-3,
+    )
+
+
+def make_trainer(
+    *,
+    max_seconds: float | None = None,
+    num_steps: int = 200_000,
+    callbacks: Mapping[str, Callback] | None = None,
+) -> Trainer:
+    """The trainer of `experiment=fast`, for a renderer of `make_renderer`.
+
+    A term that another model cannot have may be taken out before training: `del trainer.losses["time_embedding"]`.
+
+    Args:
+        max_seconds: most seconds of training, or None.
+        num_steps: most steps.
+        callbacks: by name; recovery and a progress bar if None.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+    losses = {
+        "rgb": PhotometricLoss(),
+        "elastic": ElasticLoss(),
+        "appearance_constancy": AppearanceConstancyLoss(),
+        "unseen_space": UnseenSpaceLoss(),
+        "time_embedding": TimeEmbeddingLoss(),
+    }
+    optimizer = AdamSettings(
+        {"default": 2e-2, "deformation": 6e-3, "deformation_output": 1.5e-3, "head": 5e-3},
+        final_rate=0.05, hold_until=0.3, warmup_steps=20, betas=(0.9, 0.99), epsilon=1e-15, orthogonal=True,
+    )  # fmt: skip
+    return Trainer(
+        num_steps=num_steps,
+        max_seconds=max_seconds,
+        num_rays=256,
+        target_samples=15360,
+        losses=losses,
+        pixels=ErrorGuidedPixels(TemporalCurriculum(0.3, 0.05)),
+        optimizer=optimizer,
+        callbacks={"recovery": Recovery(), "progress_bar": ProgressBar()} if callbacks is None else callbacks,
+    )

@@ -1,0 +1,191 @@
+"""Films from the first frame to the finished files: rendered frame by frame, resumed, shared, put together."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dnerf.core.checks import check_choice
+from dnerf.core.files import write_json
+from dnerf.rendering.renderer import Renderer
+from dnerf.visualization.colours import flow_image, scaled_image, value_range
+from dnerf.visualization.frame_outputs import Truth, check_outputs, render_layers
+from dnerf.visualization.frame_store import FrameStore, write_npz
+from dnerf.visualization.video import comparison_sheet, write_frames
+from dnerf.visualization.views import View
+
+FILM_FORMATS = ("mp4", "gif", "png", "npz")
+SCALE_LABELS = {"depth": "depth", "deformation": "offset"}
+MIN_VISIBLE = 1 / 255  # Opacity below which an image in 8 bits shows nothing
+
+
+@dataclass(frozen=True)
+class Share:
+    """Which frames of a film one of several processes renders: every `size`-th, from its rank on."""
+
+    rank: int = 0  # of this process, 0 <= rank < size
+    size: int = 1  # number of processes
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rank < self.size:
+            raise ValueError(f"rank must be in 0..{self.size - 1}, got {self.rank}")
+
+    def mine(self, index: int) -> bool:
+        """Whether this process renders a frame."""
+        return index % self.size == self.rank
+
+
+def render_frames_to(
+    store: FrameStore,
+    renderer: Renderer,
+    views: Sequence[View],
+    outputs: Sequence[str],
+    *,
+    truth: Truth | None = None,
+    chunk: int = 16384,
+    share: Share | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> int:
+    """Render the frames that the store lacks, each written while the next one is rendered; returns how many.
+
+    Args:
+        store: where frames go; those it holds are left alone.
+        views: the film's, as many as the store's frames; ValueError otherwise.
+        share: this process's part; all frames if None.
+        on_frame: called with the index of every frame written.
+    """
+    check_outputs(outputs)
+    if len(views) != store.num_frames:
+        raise ValueError(f"views must be {store.num_frames} as the store's frames, got {len(views)}")
+    share = share or Share()
+    missing = [i for i in store.missing() if share.mine(i)]
+
+    def finish(index: int, writing: Future[None]) -> None:
+        writing.result()
+        if on_frame is not None:
+            on_frame(index)
+
+    # Most of the time that a file takes is waiting for the disk.
+    with ThreadPoolExecutor(1) as writer:
+        in_hand: tuple[int, Future[None]] | None = None
+        try:
+            for index in missing:
+                following = views[index + 1] if index + 1 < len(views) else None
+                layers = render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk)
+                previous, in_hand = in_hand, None
+                if previous is not None:
+                    finish(*previous)
+                in_hand = index, writer.submit(store.write, index, layers)
+        finally:
+            if in_hand is not None:
+                finish(*in_hand)
+    return len(missing)
+
+
+def write_films(
+    store: FrameStore,
+    path: Path,
+    outputs: Sequence[str],
+    formats: Sequence[str],
+    *,
+    fps: float = 30.0,
+    views: Sequence[View] = (),
+) -> list[Path]:
+    """Make the finished files of a complete store; returns their paths.
+
+    The output "rgb" (or the only one) gets the path itself with the format's suffix, others `<path>_<output>`; raw
+    arrays of all outputs go into one `<path>.npz` with the layers (F, ...), times (F,), poses (F, 4, 4) and intrinsics
+    (F, 6: width, height, focal_x, focal_y, center_x, center_y in pixels) and pixel_origin (F, text: "center" or
+    "corner", the point of a pixel that its ray passes). Depth is the distance along the ray, not the z-depth.
+
+    Depth and deformation share one scale over all frames, of which 0.5 % of a frame's opaque pixels lie outside at
+    either end; the motion wheel's length is that of the 99.5 % quantile.
+
+    Args:
+        formats: some of mp4, gif, png, npz.
+        views: the film's, for the NPZ file.
+    """
+    check_outputs(outputs)
+    for format in formats:
+        check_choice("format", format, FILM_FORMATS)
+    written = []
+    for format in formats:
+        if format == "npz":
+            written.append(write_npz(store, path.with_name(f"{path.name}.npz"), _facts(views, fps)))
+            continue
+        for output in outputs:
+            name = path.name if output == "rgb" or len(outputs) == 1 else f"{path.name}_{output}"
+            target = path.with_name(name if format == "png" else f"{name}.{format}")
+            written.append(write_frames(_images(store, output), target, format, fps=fps))
+    return written
+
+
+def is_empty(store: FrameStore) -> bool:
+    """Whether no frame of a complete store shows anything: the camera looks elsewhere, or the model is empty."""
+    return not any(float(frame["max_opacity"]) >= MIN_VISIBLE for frame in store)
+
+
+def write_plan(store: FrameStore, views: Sequence[View], facts: dict[str, object]) -> None:
+    """Write the views and facts of a film beside its frames, for people."""
+    write_json(store.folder / "plan.json", {**facts, "views": [view.as_dict() for view in views]})
+
+
+def _images(store: FrameStore, output: str) -> Iterator[NDArray | torch.Tensor]:
+    if output == "rgb":
+        yield from (frame["rgb"] for frame in store)
+    elif output == "opacity":
+        yield from (np.repeat(frame["opacity"].clip(0, 1)[..., None], 3, axis=-1) for frame in store)
+    elif output == "compare":
+        for frame in store:
+            prediction, truth = (torch.from_numpy(frame[name]).float() / 255 for name in ("rgb", "truth"))
+            yield comparison_sheet([(prediction, truth)])
+    elif output == "motion":
+        longest = _longest_motion(store)
+        yield from (flow_image(torch.from_numpy(frame["motion"]), longest) for frame in store)
+    else:
+        low, high = _scale(store, output)
+        for frame in store:
+            values, opacity = torch.from_numpy(frame[output]), torch.from_numpy(frame["opacity"])
+            yield scaled_image(values, opacity, low, high, label=SCALE_LABELS[output])
+
+
+def _scale(store: FrameStore, layer: str) -> tuple[float, float]:
+    ranges = []
+    for frame in store:
+        opaque = torch.from_numpy(frame["opacity"]) >= 0.5
+        if bool(opaque.any()):
+            ranges.append(value_range(torch.from_numpy(frame[layer]), opaque))
+    if not ranges:
+        return 0.0, 1.0
+    low = 0.0 if layer == "deformation" else min(low for low, _ in ranges)
+    high = max(high for _, high in ranges)
+    return (low, high) if high > low else (low, low + 1.0)
+
+
+def _longest_motion(store: FrameStore) -> float:
+    longest = 0.0
+    for frame in store:
+        lengths = torch.from_numpy(frame["motion"]).norm(dim=-1)
+        known = lengths.isfinite()
+        if bool(known.any()):
+            longest = max(longest, value_range(lengths, known)[1])
+    return longest if longest > 0 else 1.0
+
+
+def _facts(views: Sequence[View], fps: float) -> dict[str, NDArray]:
+    facts: dict[str, NDArray] = {"fps": np.asarray(fps)}
+    if views:
+        facts["times"] = np.array([view.time for view in views])
+        facts["poses"] = np.stack([view.camera.pose.cpu().numpy() for view in views])
+        lenses, rows = [view.camera.intrinsics for view in views], []
+        for lens in lenses:
+            center_x = 0.5 * lens.width if lens.center_x is None else lens.center_x
+            center_y = 0.5 * lens.height if lens.center_y is None else lens.center_y
+            rows.append([lens.width, lens.height, lens.focal_x, lens.focal_y, center_x, center_y])
+        facts["intrinsics"] = np.array(rows)
+        facts["pixel_origin"] = np.array([lens.pixel_origin for lens in lenses])
+    return facts

@@ -1,0 +1,268 @@
+"""Losses against their formulas."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from reference import fog, occupancy_sampler
+from torch import Tensor
+
+from dnerf.core.compositing import FieldOutput, Rendering
+from dnerf.core.rays import Samples
+from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
+from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes
+from dnerf.losses import Batch, Loss, PhotometricLoss, SpaceTimeSmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
+from dnerf.rendering.renderer import Renderer
+from dnerf.samplers import StratifiedSampler
+
+RENDERER = Renderer(fog(), StratifiedSampler(4))
+
+
+def of(target: Tensor) -> Batch:
+    return Batch(torch.cat([target, torch.ones_like(target[:, :1])], dim=-1), target)
+
+
+def shown(rgb: Tensor, opacity: Tensor | None = None, proposals: tuple[Rendering, ...] = ()) -> Rendering:
+    opacity = torch.ones(len(rgb)) if opacity is None else opacity
+    return Rendering(rgb, opacity, torch.zeros(len(rgb)), proposals=proposals)
+
+
+def test_squared_error_is_the_mean_over_rays_and_channels() -> None:
+    rgb, target = torch.rand(10, 3), torch.rand(10, 3)
+    expected = sum((a - b) ** 2 for a, b in zip(rgb.flatten().tolist(), target.flatten().tolist())) / 30
+    assert PhotometricLoss()(shown(rgb), of(target), RENDERER).item() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", [PhotometricLoss(), PhotometricLoss("huber")])
+def test_rays_that_found_no_places_count_for_nothing(loss: Loss) -> None:
+    rgb, opacity, target = torch.rand(6, 3), torch.rand(6), torch.rand(6, 3)
+    placed = torch.tensor([True, True, False, True, False, False])
+    nothing = torch.zeros(0)
+    samples = Samples(nothing, nothing, 6, ray_indices=nothing.long(), is_placed=placed)
+    with_places = replace(shown(rgb, opacity), samples=samples)
+    expected = loss(shown(rgb[placed], opacity[placed]), of(target[placed]), RENDERER)
+    torch.testing.assert_close(loss(with_places, of(target), RENDERER), expected)
+
+
+def test_huber_error_is_quadratic_then_linear() -> None:
+    loss = PhotometricLoss("huber", delta=0.1)
+    target = torch.zeros(1, 3)
+    small = loss(shown(torch.full((1, 3), 0.05)), of(target), RENDERER)
+    large = loss(shown(torch.full((1, 3), 0.5)), of(target), RENDERER)
+    assert small.item() == pytest.approx(0.05**2, rel=1e-6)
+    assert large.item() == pytest.approx(2 * 0.1 * (0.5 - 0.05), rel=1e-6)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5, 1.0])
+def test_proposals_are_scored_with_their_weight(weight: float) -> None:
+    rgb, coarse, target = torch.rand(3, 10, 3)
+    loss = PhotometricLoss(proposal_weight=weight)(shown(rgb, proposals=(shown(coarse),)), of(target), RENDERER)
+    expected = (rgb - target).square().mean() + weight * (coarse - target).square().mean()
+    torch.testing.assert_close(loss, expected)
+
+
+def test_gradcheck_of_losses() -> None:
+    target = torch.rand(3, 3, dtype=torch.float64)
+    rgb = torch.rand(3, 3, dtype=torch.float64, requires_grad=True)
+    for loss in (PhotometricLoss(), PhotometricLoss("huber")):
+        assert torch.autograd.gradcheck(lambda x: loss(shown(x), of(target), RENDERER), (rgb,))  # noqa: B023
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"kind": "l1"}, "kind must be one of mse, huber; got 'l1'"),
+    ({"kind": "huber", "delta": 0.0}, "delta must be > 0"), ({"proposal_weight": -1.0}, "proposal_weight must be >= 0"),
+])  # fmt: skip
+def test_bad_photometric_loss_is_refused(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PhotometricLoss(**arguments)
+
+
+class Level(RadianceField):
+    """Fog whose density is a parameter."""
+
+    def __init__(self, density: float) -> None:
+        super().__init__()
+        self.level = torch.nn.Parameter(torch.tensor(density))
+        self.evaluated: list[tuple[Tensor, Tensor]] = []
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        self.evaluated.append((positions, times))
+        return self.level.expand(times.shape)
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        return FieldOutput(self.density(positions, times), torch.zeros_like(positions))
+
+
+class Shift(Deformation):
+    """Everything moves by half a unit along x."""
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        return positions + torch.tensor([0.5, 0.0, 0.0])
+
+
+BOX = [[-1.0] * 3, [1.0] * 3]
+
+
+def guided(density: float = 30.0, deformation: Deformation | None = None) -> Renderer:
+    sampler = occupancy_sampler(BOX, 0.02, 8, num_slabs=2)
+    return Renderer(DeformedField(deformation or IdentityDeformation(), Level(density)), sampler)
+
+
+def seen_at(positions: Tensor, weights: Tensor) -> Rendering:
+    """An image of samples at canonical positions with shares in it."""
+    output = FieldOutput(weights, torch.zeros(len(weights), 3), {"canonical_positions": positions})
+    return Rendering(torch.zeros(1, 3), torch.zeros(1), torch.zeros(1), weights=weights, output=output)
+
+
+NOTHING = seen_at(torch.zeros(0, 3), torch.zeros(0))
+TARGET = of(torch.zeros(1, 3))
+
+
+def test_unseen_space_costs_the_opacity_of_an_interval() -> None:
+    loss = UnseenSpaceLoss(BOX, num_points=100, length=0.1)(NOTHING, TARGET, guided(30.0))
+    assert loss.item() == pytest.approx(-math.expm1(-3.0), rel=1e-6)
+
+
+def test_unseen_space_is_emptied_unless_it_is_opaque() -> None:
+    for density, expected in ((0.0, 0.1), (30.0, 0.1 * math.exp(-3.0)), (1e4, 0.0)):
+        renderer = guided(density)
+        UnseenSpaceLoss(BOX, 1.0, length=0.1)(NOTHING, TARGET, renderer).backward()
+        assert renderer.field.canonical.level.grad.item() == pytest.approx(expected, rel=1e-5, abs=1e-12)
+
+
+@pytest.mark.parametrize("batch", [1, 4])
+def test_what_is_seen_in_canonical_space_costs_nothing_until_it_is_forgotten(batch: int) -> None:
+    """Half of canonical space is seen once, through a deformation that shifts by a quarter of the box."""
+    centers = torch.cartesian_prod(*[torch.arange(-0.75, 1.0, 0.5)] * 3)
+    half = centers[centers[:, 0] > 0].repeat(batch, 1)
+    renderer = guided(30.0, Shift())
+    loss = UnseenSpaceLoss(BOX, 1.0, 4000, length=0.1, resolution=4, memory_samples=4 * 32)
+    opacity = -math.expm1(-3.0)
+    # World x in [-1, 1] is canonical [-0.5, 1.5]; above 0 is three quarters, and what is beyond counts as at the face.
+    for expected in [0.25] * (1 + 4 // batch) + [1.0]:
+        shown = seen_at(half, torch.full((len(half),), 0.5 if loss.num_calls == 0 else 0.0))
+        assert loss(shown, TARGET, renderer).item() == pytest.approx(expected * opacity, rel=0.1)
+
+
+def test_a_share_too_small_to_see_does_not_count_as_seen() -> None:
+    centers = torch.cartesian_prod(*[torch.arange(-0.75, 1.0, 0.5)] * 3)
+    loss = UnseenSpaceLoss(BOX, 1.0, resolution=4, length=0.1)
+    value = loss(seen_at(centers, torch.full((64,), 1e-4)), TARGET, guided(30.0))
+    assert value.item() == pytest.approx(-math.expm1(-3.0), rel=1e-6)
+    assert loss(seen_at(centers, torch.full((64,), 1e-2)), TARGET, guided(30.0)) == 0
+
+
+def test_no_gradient_of_unseen_space_reaches_the_deformation() -> None:
+    deformation = DisplacementDeformation(1, 8, ())
+    torch.nn.init.normal_(deformation.mlp.output.weight)
+    renderer = Renderer(DeformedField(deformation, GridField(BOX, [4, 8])), occupancy_sampler(BOX, 0.02, 8))
+    UnseenSpaceLoss(BOX)(NOTHING, TARGET, renderer).backward()
+    assert all(p.grad is None for p in deformation.parameters())
+    assert renderer.field.canonical.table.grad.abs().sum() > 0
+
+
+def test_unseen_space_is_sought_in_occupied_cells_and_elsewhere_each_time() -> None:
+    renderer = guided()
+    mask = torch.zeros_like(renderer.sampler.grid.occupied)
+    mask[1, 2, 3, 4] = True
+    renderer.sampler.grid.occupy(mask)
+    loss = UnseenSpaceLoss(BOX)
+    loss(NOTHING, TARGET, renderer)
+    again = UnseenSpaceLoss(BOX)
+    again.load_state_dict(loss.state_dict())
+    for each in (loss, again):
+        each(NOTHING, TARGET, renderer)
+    evaluated = renderer.field.canonical.evaluated
+    lowest = torch.tensor([-0.5, -0.25, 0.0])
+    for positions, times in evaluated:
+        assert positions.shape == (1024, 3)
+        assert ((positions >= lowest) & (positions <= lowest + 0.25)).all()
+        assert ((times >= 0.5) & (times <= 1)).all()
+    assert not torch.equal(evaluated[0][0], evaluated[1][0])
+    assert torch.equal(evaluated[1][0], evaluated[2][0])
+
+
+@pytest.mark.parametrize(
+    "setting", [{"weight": -1.0}, {"num_points": 0}, {"length": 0.0}, {"resolution": 0}, {"memory_samples": 0}]
+)
+def test_bad_settings_of_unseen_space_are_named(setting: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        UnseenSpaceLoss(BOX, **setting)
+
+
+def test_unseen_space_needs_a_deformed_field_and_a_sampler_that_knows_cells() -> None:
+    renderer = guided()
+    loss = UnseenSpaceLoss()
+    loss.check(renderer)
+    assert torch.equal(loss.box, renderer.sampler.grid.box)  # the sampler's, where none is given
+    with pytest.raises(ValueError, match="UnseenSpaceLoss needs a deformed field, got FormulaField"):
+        loss.check(RENDERER)
+    with pytest.raises(ValueError, match="UnseenSpaceLoss needs an occupancy-aware sampler, got StratifiedSampler"):
+        loss.check(Renderer(renderer.field, StratifiedSampler(4)))
+
+
+def test_rough_volumes_cost() -> None:
+    volumes = SpaceTimeVolumes(BOX, (4,), (1,))
+    field = DeformedField(IdentityDeformation(), GridField(BOX, (4,), 2, space_time=volumes))
+    renderer, rgb = Renderer(field, StratifiedSampler(4)), torch.zeros(2, 3)
+    SpaceTimeSmoothnessLoss().check(renderer)
+    in_space, in_time = (float(x.detach()) for x in volumes.roughness())
+    assert in_space > 0 == in_time  # two times have no second difference
+    loss = SpaceTimeSmoothnessLoss(time_weight=7.0)(shown(rgb), of(rgb), renderer)
+    assert loss.item() == pytest.approx(in_space)
+    assert torch.autograd.grad(loss, volumes.tables[0])[0].abs().sum() > 0
+    with pytest.raises(ValueError, match="SpaceTimeSmoothnessLoss needs a field with space-time volumes"):
+        SpaceTimeSmoothnessLoss().check(RENDERER)
+    with pytest.raises(ValueError, match="time_weight must be >= 0"):
+        SpaceTimeSmoothnessLoss(time_weight=-1.0)
+
+
+def of_embeddings(values: list[float]) -> tuple[Renderer, torch.nn.Parameter]:
+    """A model whose deformation has learnt one feature of as many times, and these."""
+    deformation = DisplacementDeformation(1, 8, (), time_embeddings=len(values), embedding_features=1)
+    embeddings = deformation.encode_times.embeddings
+    assert embeddings is not None
+    with torch.no_grad():
+        embeddings[:, 0] = torch.tensor(values)
+    return Renderer(DeformedField(deformation, fog()), StratifiedSampler(4)), embeddings
+
+
+def test_embeddings_of_which_images_say_nothing_are_between_their_neighbours_or_as_the_last() -> None:
+    renderer, embeddings = of_embeddings([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
+    rgb = torch.rand(2, 3)
+    loss = TimeEmbeddingLoss(rays_per_embedding=None)
+    assert loss(shown(rgb), of(rgb), renderer).item() == pytest.approx((0.25 + 4.0 + 4.0) / 5, rel=1e-6)
+    optimizer = torch.optim.Adam([embeddings], lr=0.02)
+    for _ in range(600):
+        optimizer.zero_grad()
+        loss(shown(rgb), of(rgb), renderer).backward()
+        assert embeddings.grad is not None
+        embeddings.grad[[0, 3]] = 0.0  # as those whose frames keep them where they are
+        optimizer.step()
+    expected = torch.tensor([0.5, 1.0, 1.5, 2.0, 2.0, 2.0])
+    torch.testing.assert_close(embeddings.detach()[:, 0], expected, rtol=0, atol=0.02)
+
+
+def test_the_longer_times_are_looked_at_the_smoother_they_have_to_be() -> None:
+    """In proportion to rays, from a number for each embedding on: 6 embeddings of 5 rays each, 2 rays a call."""
+    renderer, _ = of_embeddings([0.5, 0.0, 0.0, 2.0, 0.0, 0.0])
+    rgb = torch.rand(2, 3)
+    loss = TimeEmbeddingLoss(rays_per_embedding=5)
+    found = [loss(shown(rgb), of(rgb), renderer).item() for _ in range(60)]
+    expected = [max(1, 2 * (call + 1) / 30) * 8.25 / 5 for call in range(60)]
+    assert found == pytest.approx(expected, rel=1e-5)
+    going_on = TimeEmbeddingLoss(rays_per_embedding=5)
+    going_on.load_state_dict(loss.state_dict())
+    assert going_on(shown(rgb), of(rgb), renderer).item() == pytest.approx(122 / 30 * 8.25 / 5, rel=1e-5)
+
+
+def test_a_model_without_embeddings_is_named_before_training() -> None:
+    TimeEmbeddingLoss().check(of_embeddings([0.0, 1.0])[0])
+    assert DisplacementDeformation(1, 8, ()).encode_times.roughness().item() == 0
+    with pytest.raises(ValueError, match="TimeEmbeddingLoss needs learnt time embeddings, this model has none"):
+        TimeEmbeddingLoss().check(RENDERER)
+    with pytest.raises(ValueError, match="weight must be >= 0"):
+        TimeEmbeddingLoss(-1.0)
+    with pytest.raises(ValueError, match="rays_per_embedding must be"):
+        TimeEmbeddingLoss(rays_per_embedding=0)

@@ -1,0 +1,61 @@
+import itertools
+import math
+from collections.abc import Callable
+
+import pytest
+
+from dnerf.visualization import pingpong_times, slow_motion_times, sweep_times
+
+
+def test_a_sweep_has_even_steps_and_both_ends_and_a_pingpong_closes() -> None:
+    assert sweep_times(5) == [0, 0.25, 0.5, 0.75, 1]
+    assert sweep_times(3, 0.8, 0.2) == pytest.approx([0.8, 0.5, 0.2])
+    assert sweep_times(1, 0.3, 0.9) == [0.3]
+    times = pingpong_times(6)
+    assert times == pytest.approx([0, 1 / 3, 2 / 3, 1, 2 / 3, 1 / 3])
+    steps = [abs(b - a) for a, b in zip(times, [*times[1:], times[0]])]
+    assert steps == pytest.approx([1 / 3] * 6)
+
+
+@pytest.mark.parametrize("path", [sweep_times, pingpong_times, slow_motion_times])
+def test_rounding_never_leaves_the_range(path: Callable[..., list[float]]) -> None:
+    for end in (0.4, 0.3, 1.0, 0.1):
+        for count in (25, 49, 60, 100):
+            assert all(0 <= time <= end for time in path(count, start=end, end=0.0))
+            assert all(0 <= time <= end for time in path(count, start=0.0, end=end))
+
+
+@pytest.mark.parametrize(("center", "width", "factor"), [(0.5, 0.4, 4.0), (0.3, 0.3, 10.0), (0.0, 0.6, 3.0)])
+def test_slow_motion_runs_at_the_stated_pace(center: float, width: float, factor: float) -> None:
+    times = slow_motion_times(2001, center=center, width=width, factor=factor)
+    assert times[0] == pytest.approx(0, abs=1e-12)
+    assert times[-1] == pytest.approx(1, abs=1e-12)
+    steps = [b - a for a, b in itertools.pairwise(times)]
+    outside = steps[-1]  # t = 1 lies outside the slow stretch of all cases
+    for time, step in zip(times, steps):
+        u = (time + step / 2 - center) / width
+        pace = 1 + (factor - 1) * math.cos(math.pi * u) ** 2 if abs(u) < 0.5 else 1
+        # steps are finite: the pace changes by up to pi (factor - 1) / width a unit of time within one
+        assert outside / step == pytest.approx(pace, abs=2 * (factor - 1) * outside * math.pi / width + 1e-6)
+
+
+def test_slow_motion_of_factor_one_is_a_sweep_and_runs_backwards_too() -> None:
+    assert slow_motion_times(7, factor=1) == pytest.approx(sweep_times(7), abs=1e-12)
+    forwards = slow_motion_times(9, center=0.5)
+    assert slow_motion_times(9, center=0.5, start=1, end=0) == pytest.approx(forwards[::-1], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"num_frames": 0}, "num_frames"),
+        ({"num_frames": 3, "start": -0.1}, "start"),
+        ({"num_frames": 3, "end": 1.5}, "end"),
+        ({"num_frames": 3, "center": 2}, "center"),
+        ({"num_frames": 3, "width": 0}, "width"),
+        ({"num_frames": 3, "factor": 0.5}, "factor"),
+    ],
+)
+def test_numbers_out_of_range_are_named(arguments: dict, named: str) -> None:
+    with pytest.raises(ValueError, match=f"^{named} must be"):
+        slow_motion_times(**arguments)
