@@ -13,8 +13,11 @@ class TrainingStopped(Exception):
     """Training was told to stop by a signal of this number, and says where it stood."""
 
     def __init__(self, number: int, message: str) -> None:
-        super().__init__(message)
+        super().__init__(number, message)  # both, so that it can be pickled
         self.number = number
+
+    def __str__(self) -> str:
+        return str(self.args[1])
 
     @property
     def exit_code(self) -> int:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import pickle
 import signal
 import threading
 
@@ -49,3 +50,8 @@ def test_other_threads_get_a_request_that_never_comes() -> None:
     thread.join()
     assert seen[0].number == 0
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_stop_can_be_sent_between_processes() -> None:
+    stop = pickle.loads(pickle.dumps(TrainingStopped(15, "stopped")))  # noqa: S301
+    assert (stop.number, str(stop), stop.exit_code) == (15, "stopped", 143)
