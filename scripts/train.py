@@ -28,11 +28,7 @@ def main(config: DictConfig) -> None:
     """Train, alone or as one of the processes that torchrun started."""
     device = resolve_device(config.device)
     with started(device, config.process_timeout) as processes, ExitStack() as held:
-        settings = processes.from_first(lambda: OmegaConf.to_yaml(continued(config)).encode())
-        assert settings is not None
-        agreed = OmegaConf.create(settings.decode())
-        assert isinstance(agreed, DictConfig)
-        train(agreed, config.resume, device, processes, held)
+        train(processes.from_first(lambda: continued(config)), config.resume, device, processes, held)
 
 
 def train(config: DictConfig, resume: bool, device: torch.device, processes: Processes, held: ExitStack) -> None:
@@ -47,9 +43,7 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     torch.manual_seed(config.seed)
     renderer = build(config.renderer, trusted=True).to(device)
     trainer = build(config.trainer, trusted=True)
-    name = processes.from_first(lambda: str(held.enter_context(opened(config))).encode())
-    assert name is not None
-    folder = Path(name.decode())
+    folder = processes.from_first(lambda: held.enter_context(opened(config)))
     if processes.is_first:
         size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
         num_parameters = sum(p.numel() for p in renderer.parameters())
@@ -70,10 +64,9 @@ def in_box(config: DictConfig, data: DataSource, frames: Frames, processes: Proc
         ValueError: if no camera sees into the box.
     """
     if "box" in config.data:
-        corners = processes.from_first(lambda: json.dumps(data.fitted_box(frames)).encode())
-        assert corners is not None
+        corners = processes.from_first(lambda: data.fitted_box(frames))
         if config.data.box == FITTED:
-            config.data.box = json.loads(corners)
+            config.data.box = corners
     config = resolved(config)
     if "box" in config.data:
         check_views(frames, torch.tensor(OmegaConf.to_container(config.data.box)))

@@ -67,10 +67,11 @@ class CachedField(DeformedField, AlongRays, FrameTabled):
     def frame_tables(self, grid: MarchGrid, num_rays: int) -> FrameTables | None:
         """See `FrameTabled`; None too where rays will need few of all displacements around occupied cells."""
         canonical, lattice = self.canonical, self.deformation
+        is_filled = lattice.fill_around(grid, num_rays)  # at once is quicker for the generic path, too
         if not isinstance(canonical, NetworkTabled) or not speaks_for(canonical, "network_tables", "forward"):
             return None
         network = canonical.network_tables()
-        if network is None or not _is_served(network, grid) or not lattice.fill_around(grid, num_rays):
+        if not is_filled or network is None or not _is_served(network, grid):
             return None
         return FrameTables(
             occupancy=grid.occupancy, skips=grid.skips, aabb=grid.aabb, displacements=lattice.displacements,

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from dnerf.core.checks import as_box, check_positive
 from dnerf.core.compositing import Rendering
 from dnerf.core.schedules import Schedule
+from dnerf.deformations import unwrapped
 from dnerf.fields import SpaceTimeVolumes
 from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import deformed
@@ -91,7 +92,7 @@ class UnseenSpaceLoss(Loss):
         unit = (number[:, None] * self.generators % 1).to(rendering.rgb.dtype)
         places = sampler.occupied_positions(unit.clamp(max=1 - torch.finfo(unit.dtype).eps))
         with torch.no_grad(), model.autocast(seen.device):
-            canonical = field.deformation(*places)
+            canonical = unwrapped(field.deformation)(*places)  # these points lie on no rays
         is_unseen = self.num_samples - self.last_seen.view(-1)[self._cells(canonical)] > self.memory_samples
         with model.autocast(seen.device):
             density = field.canonical.density(canonical, places[1])

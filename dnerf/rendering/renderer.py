@@ -141,7 +141,7 @@ class Renderer(nn.Module):
         """Render a whole image in evaluation mode, without gradients.
 
         Args:
-            camera: the view, on the model's device; in another floating-point format than float32 it is converted.
+            camera: the view, on the model's device; its pose is taken in the precision of the model's parameters.
             time: in [0, 1].
             chunk: rays rendered at a time; bounds the memory.
 

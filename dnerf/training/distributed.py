@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import timedelta
 from operator import attrgetter
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -22,6 +22,8 @@ from torch.overrides import TorchFunctionMode
 
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import Sampler
+
+Made = TypeVar("Made")
 
 # What gloo and NCCL say, as plain RuntimeErrors, when another process does not answer.
 LOST = re.compile("gloo|nccl|timed out|timeout|connection|peer", re.IGNORECASE)
@@ -97,7 +99,7 @@ class Processes:
                 for name in module.observed:
                     dist.all_reduce(attrgetter(name)(module), dist.ReduceOp.MAX)
 
-    def from_first(self, make: Callable[[], bytes | None]) -> bytes | None:
+    def from_first(self, make: Callable[[], Made]) -> Made:
         """What the first process makes, given to all; only it touches the disk.
 
         Raises:

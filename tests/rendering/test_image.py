@@ -280,3 +280,11 @@ def test_poses_of_either_precision_are_taken(
     shown = renderer.render_image(camera, 0.3)
     assert shown.rgb.dtype == shown.depth.dtype == (model_dtype or pose_dtype)
     torch.testing.assert_close(shown.rgb.float(), expected, rtol=0, atol=1e-4)
+
+
+def test_the_generic_path_fills_a_frame_s_displacements_at_once(fused: list[Tensor]) -> None:
+    renderer = model(precision="float32", subdivision=3)  # which the kernel does not serve
+    with patch.object(CachedAtTime, "_evaluated", autospec=True, side_effect=CachedAtTime._evaluated) as rounds:
+        image(renderer)
+    assert not fused
+    assert rounds.call_count == 1
