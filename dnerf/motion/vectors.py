@@ -24,9 +24,7 @@ class MotionVectors:
     flow_3d: Tensor  # (H, W, 3) in world units; NaN where not `valid`
     positions: Tensor  # (H, W, 3) the points that the pixels show, at the expected depth
     valid: Tensor  # (H, W) bool, opaque pixels of a known motion, whose surface is in front of the other camera
-    visible: (
-        Tensor  # (H, W) bool, valid pixels whose surface is inside the other image and not known to be hidden there
-    )
+    visible: Tensor  # (H, W) bool, valid pixels whose surface is inside the other image, not known to be hidden there
     residual: Tensor  # (H, W) see `carry`; NaN where not `valid`
 
     @property
@@ -78,10 +76,8 @@ def motion_vectors(
         distance = (moved - other_camera.pose[:3, 3]).norm(dim=-1)
         visible &= distance <= _nearest(other_depth, pixels) + TOLERANCE
     flow_2d = torch.where(valid[:, None], pixels - camera.project(positions)[0], torch.nan)
-    flow_3d, residual = (
-        torch.where(valid[:, None], moved - positions, torch.nan),
-        torch.where(valid, residual, torch.nan),
-    )
+    flow_3d = torch.where(valid[:, None], moved - positions, torch.nan)
+    residual = torch.where(valid, residual, torch.nan)
     found = (flow_2d, flow_3d, positions, valid, visible, residual)
     return MotionVectors(*(values.reshape(*size, *values.shape[1:]) for values in found))
 
