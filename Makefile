@@ -29,7 +29,7 @@ $(DEMO)/renders/orbit.mp4: $(DEMO)/metrics.json
 	$(BIN)/python scripts/render.py run=$(DEMO) path=orbit time=pingpong num_frames=60 fps=30 format=mp4
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

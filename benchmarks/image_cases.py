@@ -5,15 +5,13 @@ from typing import Any
 
 import torch
 
-from benchmarks.kernel_cases import PLAIN, STEP, Call, Case, Workload, backends
+from benchmarks.kernel_cases import STEP, Call, Case, Workload, backends
 from dnerf.core.cameras import Camera, Intrinsics, look_at
 from dnerf.kernels import (
     FrameTables,
     add_seen,
     covered_places,
-    few_nonzero,
     footprints,
-    lattice_places,
     seen_parts,
     shade,
     trace_network,
@@ -30,7 +28,7 @@ def image_cases(work: Workload) -> list[Case]:
 def _cell_cases(work: Workload) -> list[Case]:
     """Of a whole grid, whatever the samples."""
     occupied, side = work.occupancy[0], DISPLACEMENTS + 1
-    cells = torch.stack(torch.unravel_index(few_nonzero(occupied), occupied.shape))
+    cells = occupied.nonzero().T.contiguous()
     # Vertices of the displacements' lattice around them.
     lows, ends = cells * DISPLACEMENTS // len(occupied), -(-(cells + 1) * DISPLACEMENTS // len(occupied)) + 1
     covering = partial(covered_places, lows, ends, (side,) * 3)
@@ -39,12 +37,6 @@ def _cell_cases(work: Workload) -> list[Case]:
     covered = view()
     num_pixels = 0 if covered is None else len(covered.pixels)
     return [
-        Case(
-            "few_nonzero",
-            "forward",
-            backends(partial(few_nonzero, occupied)) | {PLAIN: lambda: occupied.view(-1).nonzero()[:, 0]},
-            occupied.nbytes + 8 * cells.shape[1],
-        ),
         Case("covered_places", "forward", backends(covering), lows.nbytes + ends.nbytes + covering().nbytes),
         Case("footprints", "forward", backends(view), occupied.nbytes + 16 * num_pixels),
     ]
@@ -52,13 +44,8 @@ def _cell_cases(work: Workload) -> list[Case]:
 
 def _sample_cases(work: Workload) -> list[Case]:
     n, r, found = 4 * work.num_samples, work.rays, work.marched
-    low, sides, side = work.box[0], work.box[1] - work.box[0], DISPLACEMENTS + 1
     thin, light = torch.full_like(work.distances, 5.0), torch.ones_like(r.near)
     sums = torch.zeros(len(r), 5)
-    places = partial(
-        lattice_places, r.origins, r.directions, found.ray_indices, work.distances, torch.zeros(side**3, 4),
-        (side,) * 3, low, sides,
-    )  # fmt: skip
     parts = partial(
         seen_parts, found.starts, found.ends, found.offsets, thin, light, subdivision=3, subdivision_weight=0.02,
         min_weight=4e-3,
@@ -68,7 +55,6 @@ def _sample_cases(work: Workload) -> list[Case]:
     )  # fmt: skip
     products = torch.randn(work.num_samples, 4).bfloat16()
     return [
-        Case("lattice_places", "forward", backends(places), 6 * n),
         Case("seen_parts", "forward", backends(parts), 3 * n + 16 * work.num_samples),
         Case("add_seen", "forward", backends(adding), 6 * n + 2 * sums.nbytes),
         Case("shade", "forward", backends(partial(shade, products, torch.zeros(4), -1.0)), 24 * work.num_samples),

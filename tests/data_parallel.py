@@ -176,7 +176,7 @@ def main() -> None:
     torch.set_num_threads(1)  # comparing large tensors begins threads otherwise, and forks of such a process hang
     load_everything()
     result = {model: compare(model) for model in MODELS}
-    for case, number, timeout in (("killed", "KILL", 60), ("hanging", "STOP", 8), ("told to stop", "TERM", 60)):
+    for case, number, timeout in (("killed", "KILL", 60), ("hanging", "STOP", 5), ("told to stop", "TERM", 60)):
         result[case] = mishap(signal.Signals[f"SIG{number}"], timeout)
     sys.stdout.write(json.dumps(result))
 

@@ -11,7 +11,7 @@ from dnerf.data.carving import EVERY_PIXEL, Silhouettes, carve, hold_opaque
 from dnerf.data.frames import Frames
 from dnerf.samplers import OccupiedCells
 
-ROOM = 0.05  # at each face, of the longest side: surfaces are softer in training than they are
+ROOM = 0.03  # at each face, of the longest side: surfaces are softer in training than they are
 ROOM_AROUND_POINTS = 0.15  # they are few, and none lie on what moves
 QUANTILE = 0.01  # of sparse points, at either end of each axis, that may be wrong
 SHARES = (0.5, 0.1, 0.0)  # of the views, that see what the box has to hold: the first that is enough

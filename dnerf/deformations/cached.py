@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive
-from dnerf.core.rays import Rays
 from dnerf.deformations.base import (
     Deformation,
     PerFrame,
@@ -16,7 +15,7 @@ from dnerf.deformations.base import (
     check_positions_times,
     deformation_at_time,
 )
-from dnerf.kernels import GridLevels, MarchGrid, covered_places, few_nonzero, grid_encode, lattice_places
+from dnerf.kernels import GridLevels, MarchGrid, covered_places, grid_encode
 
 LEAST_ROWS = 256  # fewer take matrix libraries as long
 FEW_POINTS = 1024  # whose cells' vertices are listed, not marked in the whole lattice
@@ -123,21 +122,6 @@ class CachedAtTime(Deformation):
             moved[rest] = self.deformation(points[rest], times.reshape(-1)[rest]).to(moved.dtype)
         return moved.reshape(positions.shape)
 
-    @torch.no_grad()
-    def along_rays(self, rays: Rays, ray_indices: Tensor, distances: Tensor) -> Tensor:
-        """Canonical positions (N, 3) at distances (N,), in world units, along the rays with numbers (N,) int64."""
-        check_one_time(rays.times, self.time)
-        self.move_to(distances.device)
-        canonical = lattice_places(
-            rays.origins, rays.directions, ray_indices, distances, self.displacements, self.is_known.shape, self.low,
-            self.sides,
-        )  # fmt: skip
-        if not bool(canonical.sum().isfinite()):  # one sum is quicker than looking at each
-            rest = few_nonzero(canonical[:, 0].isnan())
-            positions, _, times = rays.places(ray_indices[rest], distances[rest])
-            canonical[rest] = self(positions, times).to(canonical.dtype)
-        return canonical
-
     def move_to(self, device: torch.device) -> None:
         """Have what is kept on a device."""
         if self.displacements.device != device:
@@ -162,7 +146,7 @@ class CachedAtTime(Deformation):
         for axis in range(3):
             length = needed.shape[axis] - 1
             needed.narrow(axis, 1, length).logical_or_(needed.narrow(axis, 0, length).clone())
-        self.fill(few_nonzero(needed & ~self.is_known))
+        self.fill((needed & ~self.is_known).view(-1).nonzero()[:, 0])
 
     def fill_around(self, grid: MarchGrid, num_rays: int) -> bool:
         """Fill what rays through a grid's occupied cells will need at once: every round of evaluations has its price.
@@ -187,7 +171,7 @@ class CachedAtTime(Deformation):
         units) in every direction.
         """
         firsts, ends = [], []
-        for axis, cell in enumerate(torch.unravel_index(few_nonzero(occupied), occupied.shape)):
+        for axis, cell in enumerate(occupied.nonzero().unbind(-1)):
             size, cells = occupied.shape[axis], self.levels.cells[axis]
             faces = torch.lerp(aabb[0, axis], aabb[1, axis], torch.linspace(0, 1, size + 1, device=aabb.device))
             lows, highs = (

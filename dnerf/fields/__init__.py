@@ -1,13 +1,13 @@
 """Radiance fields: density and colour at positions, directions and times."""
 
 from dnerf.core.compositing import FieldOutput
-from dnerf.fields.base import AlongRays, NetworkTabled, RadianceField, TimeDependence, evaluate_along_rays
+from dnerf.fields.base import NetworkTabled, RadianceField, TimeDependence, evaluate_along_rays
 from dnerf.fields.deformed import CachedField, DeformedField
 from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
 from dnerf.fields.space_time import SpaceTimeVolumes
 
 __all__ = [
-    "AlongRays", "CachedField", "DeformedField", "FieldOutput", "GridField", "NeRFField", "NetworkTabled",
+    "CachedField", "DeformedField", "FieldOutput", "GridField", "NeRFField", "NetworkTabled",
     "RadianceField", "SpaceTimeVolumes", "TimeDependence", "evaluate_along_rays",
 ]  # fmt: skip

@@ -76,14 +76,6 @@ class FrameTabled(ABC):
         processor of now. The grid holds the occupied cells of that time."""
 
 
-class AlongRays(ABC):
-    """A field that is evaluated more cheaply where positions are given as distances along rays."""
-
-    @abstractmethod
-    def along_rays(self, rays: Rays, ray_indices: Tensor, distances: Tensor) -> FieldOutput:
-        """What `forward` gives at distances (N,) along the rays with numbers (N,) int64, without extras."""
-
-
 def field_at_time(field: RadianceField, time: float, extent: Tensor | None = None) -> RadianceField:
     """`field.at_time`, unless a subclass has another `forward` or `density` than the class that wrote it."""
     return field.at_time(time, extent) if speaks_for(field, "at_time", "forward", "density") else field
@@ -101,14 +93,8 @@ def evaluate_along_rays(
     if padding:
         ray_indices, distances = (torch.cat([x, x[-1:].expand(padding)]) for x in (ray_indices, distances))
     parts = [
-        _evaluated(field, rays, *part)
+        field(*rays.places(*part))
         for part in zip(ray_indices.split(MOST_AT_ONCE), distances.split(MOST_AT_ONCE), strict=True)
     ]
     density, rgb = (torch.cat(x) if len(x) > 1 else x[0] for x in zip(*((p.density, p.rgb) for p in parts)))
     return FieldOutput(density[:count], rgb[:count])
-
-
-def _evaluated(field: RadianceField, rays: Rays, ray_indices: Tensor, distances: Tensor) -> FieldOutput:
-    if isinstance(field, AlongRays) and speaks_for(field, "along_rays", "forward"):
-        return field.along_rays(rays, ray_indices, distances)
-    return field(*rays.places(ray_indices, distances))

@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from dnerf.core.compositing import FieldOutput
-from dnerf.core.rays import Rays
 from dnerf.core.shortcuts import speaks_for
 from dnerf.deformations import CachedAtTime, Deformation
 from dnerf.deformations.base import deformation_at_time
-from dnerf.fields.base import AlongRays, FrameTabled, NetworkTabled, NetworkTables, RadianceField, field_at_time
+from dnerf.fields.base import FrameTabled, NetworkTabled, NetworkTables, RadianceField, field_at_time
 from dnerf.kernels import FrameTables, MarchGrid, is_traced
 
 
@@ -53,16 +52,10 @@ class DeformedField(RadianceField):
         return field
 
 
-class CachedField(DeformedField, AlongRays, FrameTabled):
+class CachedField(DeformedField, FrameTabled):
     """A deformed field at one time whose displacements are kept on a lattice, see `CachedAtTime`."""
 
     deformation: CachedAtTime
-
-    def along_rays(self, rays: Rays, ray_indices: Tensor, distances: Tensor) -> FieldOutput:
-        """What `forward` gives at distances (N,) along the rays with numbers (N,) int64, without extras."""
-        positions = self.deformation.along_rays(rays, ray_indices, distances)
-        times = distances.new_tensor(self.deformation.time).expand(distances.shape)
-        return self.canonical(positions, rays.directions.index_select(0, ray_indices), times)
 
     def frame_tables(self, grid: MarchGrid, num_rays: int) -> FrameTables | None:
         """See `FrameTabled`; None too where rays will need few of all displacements around occupied cells."""

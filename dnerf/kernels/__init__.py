@@ -3,11 +3,9 @@
 from .add_seen import add_seen
 from .backend import BACKENDS, get_backend, set_backend, use_backend
 from .covered_places import covered_places
-from .few_nonzero import few_nonzero
 from .footprints import Footprints, footprints
 from .grid_encode import GridLevels, grid_encode
 from .grid_network import grid_network
-from .lattice_places import lattice_places
 from .march import MarchedSamples, MarchGrid, march
 from .march_to_size import march_to_size
 from .packed_sum import packed_sum
@@ -21,7 +19,7 @@ from .trace_network import FrameTables, is_traced, trace_network
 
 __all__ = [
     "BACKENDS", "Footprints", "FrameTables", "GridLevels", "MarchGrid", "MarchedSamples", "SeenParts", "add_seen",
-    "covered_places", "few_nonzero", "footprints", "get_backend", "grid_encode", "grid_network", "is_bfloat16_wanted",
-    "is_traced", "lattice_places", "march", "march_to_size", "packed_sum", "packed_weights", "relu_layers",
-    "seen_parts", "set_backend", "shade", "skip_distances", "thin_out", "trace_network", "use_backend",
+    "covered_places", "footprints", "get_backend", "grid_encode", "grid_network", "is_bfloat16_wanted", "is_traced",
+    "march", "march_to_size", "packed_sum", "packed_weights", "relu_layers", "seen_parts", "set_backend", "shade",
+    "skip_distances", "thin_out", "trace_network", "use_backend",
 ]  # fmt: skip

@@ -10,7 +10,6 @@ from dnerf.core.geometry import cube_corners
 
 from .backend import choose, run_compiled
 from .checks import check_cells, check_shapes
-from .few_nonzero import few_nonzero
 
 
 class Footprints(NamedTuple):
@@ -51,7 +50,7 @@ def footprints(
     check_shapes(aabb=(aabb, (2, 3)), pose=(pose, (4, 4)))
     if len(lens) != 4 or len(size) != 2 or min(size) < 0:
         raise ValueError(f"lens must be four numbers and size two, not negative, got {tuple(lens)} and {tuple(size)}")
-    places = few_nonzero(occupancy)
+    places = occupancy.reshape(-1).nonzero()[:, 0]
     low, high = aabb.to(pose.dtype)
     faces = [
         torch.lerp(low[axis], high[axis], torch.linspace(0, 1, cells + 1, dtype=pose.dtype, device=pose.device))

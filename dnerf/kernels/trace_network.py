@@ -10,9 +10,8 @@ from dnerf.core.checks import check_positive, check_shape, check_whole
 
 from .backend import run_compiled
 from .checks import check_cells, check_shapes
-from .grid_encode import GridLevels, check_grid
+from .grid_encode import GridLevels, check_grid, grid_encode_reference
 from .grid_network import grid_network_reference, is_fused
-from .lattice_places import lattice_places_reference
 from .march import kept_intervals
 from .shade import shade_reference
 from .skip_distances import blocks_shape
@@ -124,11 +123,15 @@ def trace_network_reference(
     states[:, 0] = 1
     is_done, goes_on = (torch.ones(len(origins), dtype=torch.bool, device=near.device) for _ in range(2))
 
+    shape = tables.is_known.shape
+    levels = GridLevels([[length - 1 for length in reversed(shape)]], 1 << (shape.numel() - 1).bit_length())
+
     def ask(chosen: Tensor, middles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Densities and colours of chosen rays (n,) at distances, and whether they are known."""
-        places = lattice_places_reference(
-            origins, directions, chosen, middles, tables.displacements, tables.is_known.shape, tables.low, tables.sides
-        )
+        places = origins[chosen] + middles[:, None] * directions[chosen]
+        lattice = (places - tables.low) / tables.sides
+        places = places + grid_encode_reference(lattice, tables.displacements[:, :3], levels)
+        places[~((lattice >= 0) & (lattice <= 1)).all(-1)] = torch.nan
         unit = (places - tables.field_low) * tables.field_scale
         raw = grid_network_reference(unit, tables.table, tables.levels, tables.weights, tables.biases)
         return *shade_reference(raw.float(), tables.shifts, 0.0), places.isfinite().all(-1)

@@ -14,7 +14,7 @@ from dnerf.core.compositing import Rendering, safe_divide
 from dnerf.core.rays import Rays, Samples
 from dnerf.core.shortcuts import speaks_for
 from dnerf.fields.base import PAD_TO, FrameTabled, RadianceField, evaluate_along_rays, field_at_time
-from dnerf.kernels import MarchGrid, add_seen, few_nonzero, trace_network
+from dnerf.kernels import MarchGrid, add_seen, trace_network
 from dnerf.rendering.frame_graphs import FrameGraphs
 from dnerf.samplers.base import Capacity, FixedCapacity, FrontToBack, OccupancyAware
 from dnerf.samplers.visibility import PackedRounds, Source, walk_front_to_back
@@ -101,7 +101,7 @@ def _without_gradients(
     if fused is not None:
         with renderer.autocast(rays.origins.device):
             sums, is_done = fused(rays)
-        numbers = few_nonzero(~is_done)
+        numbers = (~is_done).nonzero()[:, 0]
         if not len(numbers):
             return _over_background(renderer, rays, sums)
     sampler = renderer.sampler

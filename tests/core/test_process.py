@@ -64,7 +64,8 @@ def test_freed_memory_is_kept_unless_switched_off():
 
 @pytest.mark.skipif(CORES < 2, reason="on one core GNU OpenMP never spins for long")
 def test_waiting_threads_spin_only_while_enough_cores_are_free():
-    seconds, threads = printed(WAITING)[::2], printed(WAITING)[1::2]
+    found = printed(WAITING)
+    seconds, threads = found[::2], found[1::2]
     free, lacking, still_lacking, free_again = map(float, seconds)
     assert max(lacking, still_lacking) < 0.5 * min(free, free_again)
     assert threads[0] == threads[3]

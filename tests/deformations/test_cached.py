@@ -1,7 +1,5 @@
 """The lattice that stands in for a deformation while one frame is rendered."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from reference import occupancy_sampler
@@ -179,27 +177,6 @@ def test_part_of_a_lattice_where_there_is_none_is_still_one(corners: tuple[float
     x = points(40, 2, torch.float32)
     times = torch.full((40,), 0.7)
     torch.testing.assert_close(part(x, times), Bend()(x, times), rtol=0, atol=1e-3)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_along_rays_it_is_what_it_is_at_their_positions(dtype: torch.dtype) -> None:
-    """Places outside the lattice and in cells that are not known yet among them."""
-    lattice = CachedDeformation(Bend(), BOX, 12)
-    rays = Camera(Intrinsics(9, 9, 8.0, 8.0), look_at((0.3, -3.0, 0.5), (0.0, 0.0, 0.0))).rays(0.7).to(dtype)
-    g = torch.Generator().manual_seed(0)
-    indices = torch.randint(len(rays), (900,), generator=g).sort().values
-    distances = 2 + 2.5 * torch.rand(900, generator=g, dtype=dtype)
-    positions, _, times = rays.places(indices, distances)
-    along, evaluated = lattice.at_time(0.7), lattice.at_time(0.7)
-    evaluated(positions, times)
-    for _ in range(2):  # vertices unknown, then known
-        found = along.along_rays(rays, indices, distances)
-        torch.testing.assert_close(found, evaluated(positions, times), rtol=0, atol=1e-6)
-        assert torch.equal(along.is_known, evaluated.is_known)
-    outside = (positions < torch.tensor(BOX[0])).any(-1) | (positions > torch.tensor(BOX[1])).any(-1)
-    assert 100 < int(outside.sum()) < 800
-    with pytest.raises(ValueError, match=r"times must all be 0.7"):
-        along.along_rays(replace(rays, times=rays.times + 0.1), indices, distances)
 
 
 def test_shapes_emptiness_and_other_times() -> None:
