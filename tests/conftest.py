@@ -2,11 +2,10 @@
 
 import os
 
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
 # Tests in parallel share the cores; this is read when torch is imported, and by the scripts that tests start.
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
-    os.environ["OMP_NUM_THREADS"] = str(max(1, CORES // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    os.environ["OMP_NUM_THREADS"] = str(max(1, cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])))
 
 import pytest
 import torch
@@ -19,11 +18,6 @@ if not torch.cuda.is_available():
 
 settings.register_profile("dnerf", derandomize=True, deadline=None, max_examples=50)
 settings.load_profile("dnerf")
-
-
-def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: there is always a test that waits for a process."""
-    return CORES + 1
 
 
 @pytest.fixture(autouse=True)

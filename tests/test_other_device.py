@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from other_device import is_possible
 
-pytestmark = pytest.mark.skipif(not is_possible, reason="this torch cannot pretend devices")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not is_possible, reason="this torch cannot pretend devices")]
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,8 @@ MAX_RAYS = 12_000  # of outlines, evenly spread over all views: half a second on
 NUM_DISTANCES = 48  # along each
 MAX_SUPPORT = 16  # views: random ones from a hemisphere meet in little more than the body
 SHARE_OF_SUPPORT = 0.75  # of the largest along a ray, which a position needs
-MOTIONS = (0.001, 0.005, 0.02, 0.08)  # of an image's longer side, from one time to the next: the first with enough support
+# Of an image's longer side, from one time to the next: the first with enough support.
+MOTIONS = (0.001, 0.005, 0.02, 0.08)
 ENOUGH = 8  # views
 MAX_DISTANCE = 32  # blocks, up to which motion is allowed for
 EVERY_PIXEL = 3  # in rows and columns, of those that are looked at one by one

@@ -174,7 +174,8 @@ def test_an_empty_film_is_noticed(work, capsys):
     assert "path.radius=4.0, path.target=[0, 0, 99]" in said
 
 
-def test_consistency_is_checked_and_written(work, capsys):
+def test_consistency_is_checked_and_written(work, capsys, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("evaluate"), "CONSISTENCY_PIXELS", 8)
     call("evaluate", "run=run", "worst=0", "plots=false", "consistency=true")
     checks = json.loads((work / "run" / "consistency.json").read_text())["checks"]
     assert [check["check"] for check in checks] == ["time continuity", "no popping", "colour along tracks"]
