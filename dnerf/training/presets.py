@@ -70,7 +70,7 @@ def make_renderer(
         subdivision=2, render_subdivision=3, subdivision_weight=0.02, narrow_from=0.3, min_weight=1e-4, filter_joins=2,
     )  # fmt: skip
     return Renderer(
-        DeformedField(CachedDeformation(along_rays, corners, 80), field),
+        DeformedField(CachedDeformation(along_rays, corners), field),
         sampler,
         RandomBackground("white") if background is None else background,
         precision="bfloat16",
