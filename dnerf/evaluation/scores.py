@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from statistics import fmean
+from statistics import fmean, median
 
 import torch
 from torch import Tensor
@@ -35,7 +35,7 @@ class Evaluation:
     psnr: float  # mean of the frames' PSNR, in dB
     ssim: float  # mean of the frames' SSIM
     num_frames: int  # number of frames
-    seconds_per_frame: float  # mean wall-clock seconds to render one
+    seconds_per_frame: float  # median wall-clock seconds to render one; the first may wait for compilation
     frames: Sequence[FrameScore]  # each frame's score
     lpips: float | None = None  # mean of the frames' LPIPS, or None
 
@@ -73,14 +73,14 @@ def evaluate(
     was_training = renderer.training
     renderer.eval()
     background = renderer.background(torch.zeros(1, 3, device=device))[0]
-    scores, seconds = [], 0.0
+    scores, seconds = [], []
     for i in spread_indices(len(frames), max_frames):
         camera, frame_time = frames.camera(i), float(frames.times[i])
         begin = time.perf_counter()
         prediction = renderer.render_image(camera, frame_time, chunk=chunk).rgb.clamp(0, 1)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        seconds += time.perf_counter() - begin
+        seconds.append(time.perf_counter() - begin)
         truth = frames.image(i, background)
         score = FrameScore(i, frame_time, min(psnr(prediction, truth), MAX_PSNR), ssim(prediction, truth))
         if lpips is not None:
@@ -92,7 +92,7 @@ def evaluate(
     distances = [score.lpips for score in scores if score.lpips is not None]
     means = fmean(score.psnr for score in scores), fmean(score.ssim for score in scores)
     lpips_mean = fmean(distances) if distances else None
-    return Evaluation(split, *means, len(scores), seconds / len(scores), scores, lpips_mean)
+    return Evaluation(split, *means, len(scores), median(seconds), scores, lpips_mean)
 
 
 def scores_by_time(frames: Sequence[FrameScore], end: float) -> dict[str, dict[str, float | int | None]]:
