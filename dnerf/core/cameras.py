@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dnerf.core.checks import check_choice, check_positive, check_shape
 from dnerf.core.geometry import check_last_axis
+from dnerf.core.lenses import Distortion
 from dnerf.core.rays import Rays
 
 PIXEL_OFFSETS = {"center": 0.5, "corner": 0.0}
@@ -31,6 +32,7 @@ class Intrinsics:
     center_x: float | None = None  # principal point, from the left edge; the image's middle if None
     center_y: float | None = None  # the same from the top edge
     pixel_origin: str = "center"  # or "corner"
+    distortion: Distortion | None = None  # of the lens; None for a pinhole
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "focal_x", "focal_y"):
