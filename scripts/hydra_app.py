@@ -146,6 +146,13 @@ def moved(saved: DictConfig, data_root: str | None) -> None:
     saved.data.root = data_root
 
 
+def resolved(config: DictConfig) -> DictConfig:
+    """A config without interpolations."""
+    values = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    assert isinstance(values, DictConfig)
+    return values
+
+
 def build(config: DictConfig, *, trusted: bool = False) -> Any:
     """The objects that a config node describes.
 

@@ -10,10 +10,12 @@ import sweeps
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
-from hydra_app import load_config, moved
+from hydra_app import load_config, moved, resolved
 from omegaconf import DictConfig, OmegaConf, open_dict
+from planning import OVERRIDES, as_decided
 
 from dnerf.core.files import TEMPORARY, claimed, remove_leftovers, write_json, write_text
+from dnerf.planning.plan import FILE
 from dnerf.training.checkpoint_folder import CHECKPOINTS, CheckpointFolder
 
 # What may be another when a run is continued: how long, where and how it is watched, not what is trained.
@@ -59,7 +61,7 @@ def continued(config: DictConfig) -> DictConfig:
     if _is_free(folder) and not all(map(_may_change, given)):
         return config
     moved(saved, config.data_root)
-    values = config.copy()
+    values = as_decided(config, folder, saved.data.get("box")).copy()
     if values.data.get("box") == FITTED:  # the run knows which box that is
         values.data.box = saved.data.get("box", FITTED)
     values = resolved(values)
@@ -72,13 +74,6 @@ def continued(config: DictConfig) -> DictConfig:
     for key in filter(_may_change, given):
         OmegaConf.update(saved, key, OmegaConf.select(values, key), force_add=True)
     return saved
-
-
-def resolved(config: DictConfig) -> DictConfig:
-    """A config without interpolations."""
-    values = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
-    assert isinstance(values, DictConfig)
-    return values
 
 
 def _may_change(key: str) -> bool:
@@ -142,8 +137,8 @@ def opened(config: DictConfig) -> Iterator[Path]:
         for path in (folder, *(folder / name for name in OWN_FOLDERS)):
             remove_leftovers(path)
         save_config(folder, config)
-        if is_free or not (folder / "overrides.json").exists():
-            write_json(folder / "overrides.json", list(HydraConfig.get().overrides.task))
+        if is_free or not (folder / OVERRIDES).exists():
+            write_json(folder / OVERRIDES, list(HydraConfig.get().overrides.task))
         yield folder
 
 
@@ -162,4 +157,4 @@ def _is_free(folder: Path) -> bool:
     paths = [path for path in folder.iterdir() if not path.name.startswith(TEMPORARY)]
     left = {path.name for path in paths if not path.is_dir() or any(path.iterdir())}
     # A lone config.yaml may be anybody's.
-    return not left or left == {"config.yaml", "overrides.json"}
+    return not left or left - {FILE} == {"config.yaml", OVERRIDES}

@@ -5,11 +5,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import planning
 import torch
-from hydra_app import build, resolve_device, run_app
+from hydra_app import build, resolve_device, resolved, run_app
 from omegaconf import DictConfig, OmegaConf
 from reporting import evaluate_run, print_scores
-from run_folder import FITTED, continued, opened, resolved
+from run_folder import FITTED, continued, opened, save_config
 
 from dnerf.core.files import write_json
 from dnerf.data.background_check import background_contradiction
@@ -17,6 +18,7 @@ from dnerf.data.bounds import check_views
 from dnerf.data.frames import Frames
 from dnerf.data.source import DataSource
 from dnerf.evaluation.provenance import commit, hardware
+from dnerf.planning.plan import FILE
 from dnerf.rendering.renderer import Renderer
 from dnerf.training.distributed import Processes, started
 from dnerf.training.records import TrainingRecord
@@ -39,12 +41,23 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     frames = data.frames("train")
     fitted = config.data.get("box") == FITTED
     config = in_box(config, data, frames, processes)
+    folder = processes.from_first(lambda: held.enter_context(opened(config)))
+    plan, begun = None, None
+    if parts := planning.parts_of(config):
+        if processes.size == 1:
+            plan, begun = planning.decide(config, parts, frames, device, folder)
+        else:  # the first one decides, and training begins anew
+            plan = processes.from_first(lambda: planning.decide(config, parts, frames, device, folder)[0])
+        config = planning.composed(parts, plan.choices, config.data.get("box"), planning.given_overrides(folder))
     # The same seed in every process: they begin with one model.
     torch.manual_seed(config.seed)
-    renderer = build(config.renderer, trusted=True).to(device)
+    renderer = build(config.renderer, trusted=True).to(device) if begun is None else begun.renderer
     trainer = build(config.trainer, trusted=True)
-    folder = processes.from_first(lambda: held.enter_context(opened(config)))
     if processes.is_first:
+        if plan is not None:
+            plan.save(folder / FILE)
+            save_config(folder, config)
+            print(plan.table())
         size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
         num_parameters = sum(p.numel() for p in renderer.parameters())
         print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {renderer.device}")
@@ -52,7 +65,9 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
         color = renderer.background.constant()
         if color is not None and (said := background_contradiction(color, frames)):
             print(f"warning: {said}")
-    record = trainer.fit(renderer, frames, seed=config.seed, folder=folder, resume=resume, processes=processes)
+    record = trainer.fit(
+        renderer, frames, seed=config.seed, folder=folder, resume=resume, processes=processes, begun=begun
+    )
     if processes.is_first:
         finish(config, resume, folder, renderer, data, record)
 

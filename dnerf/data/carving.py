@@ -45,12 +45,12 @@ class Silhouettes:
     distances: Tensor
 
     @classmethod
-    def of(cls, frames: Frames) -> "Silhouettes":
-        """The silhouettes of frames with alpha."""
+    def of(cls, frames: Frames, least: int = OPAQUE) -> "Silhouettes":
+        """The silhouettes of frames with alpha: pixels of at least so much, of 255."""
         block = -(-max(frames.images.shape[1:3]) // NUM_BLOCKS)
         order = frames.times.argsort(stable=True)
         blocks = [max_pool2d(frames.images[i, None, ..., 3].float(), block, ceil_mode=True) for i in order.tolist()]
-        opaque = torch.cat(blocks) >= OPAQUE
+        opaque = torch.cat(blocks) >= least
         distances = torch.where(opaque, 0, 255).to(torch.uint8)
         for distance in range(1, MAX_DISTANCE + 1):
             opaque = _dilated(opaque)
@@ -93,6 +93,17 @@ class Silhouettes:
                 alive = alive[self._are_opaque(others, rays, alive // distances.shape[1], flat[alive], reach)]
                 support[alive] += 1
         return support.clamp(max=MAX_SUPPORT).view_as(distances)
+
+    def share_of_views(self, rays: Rays, distances: Tensor, reach: int) -> Tensor:
+        """The share (R, D) of all views that have positions at distances (R, D) within so many blocks of an opaque
+        pixel."""
+        flat = distances.reshape(-1)
+        index = torch.arange(len(rays), device=flat.device).repeat_interleave(distances.shape[1])
+        share = torch.zeros_like(flat)
+        for view in range(len(self.poses)):
+            others = torch.full((len(rays),), view, device=flat.device)
+            share += self._are_opaque(others, rays, index, flat, torch.full_like(others, reach))
+        return (share / len(self.poses)).view_as(distances)
 
     def _are_opaque(self, others: Tensor, rays: Rays, index: Tensor, distances: Tensor, reach: Tensor) -> Tensor:
         """Whether positions (N,) on rays `index` are within `reach` (R,) blocks of opaque ones of other views (R,)."""

@@ -109,7 +109,7 @@ class TemporalCurriculum(PixelSampler, FrameSubset):
         return drawn if frames is None else frames[drawn // self._size] * self._size + drawn % self._size
 
 
-class ErrorGuidedPixels(PixelSampler):
+class ErrorGuidedPixels(PixelSampler, FrameSubset):
     """Another pixel sampler's pixels, of which a share is drawn anew where images are wrong.
 
     Frames are cut into square blocks that know the squared error of the rays drawn in them of late. Blocks are drawn in
@@ -149,12 +149,16 @@ class ErrorGuidedPixels(PixelSampler):
         rows, columns = (-(-side // self._block) for side in self._sides)
         self.errors = torch.full((num_frames, rows, columns), UNKNOWN, device=frames.images.device)
 
+    def frames_in(self, progress: float) -> Tensor | None:
+        """See `FrameSubset`: those of the other pixel sampler."""
+        return self.pixels.frames_in(progress) if isinstance(self.pixels, FrameSubset) else None
+
     def draw(self, count: int, progress: float, generator: torch.Generator) -> Tensor:
         """Pixels (count,), the guided ones last."""
         even = self.pixels.draw(count, progress, generator)
         guided = int(self.share * count)
         height, width = self._sides
-        frames_in = self.pixels.frames_in(progress) if isinstance(self.pixels, FrameSubset) else None
+        frames_in = self.frames_in(progress)
         errors = self.errors if frames_in is None else self.errors.index_select(0, frames_in)
         bounds = errors.reshape(-1).cumsum(0, dtype=torch.float64)
         unit = torch.rand(3, guided, dtype=torch.float64, generator=generator, device=generator.device)

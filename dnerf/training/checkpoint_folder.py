@@ -91,19 +91,21 @@ class Checkpoints(Callback):
         self.every = every
 
     def on_train_begin(self, run: Run) -> None:
-        """Continue from the newest checkpoint, if the run is to be continued and has one.
+        """Continue from the newest checkpoint of a run that is to be continued; else keep what a begun one stands at.
 
         Raises:
             ValueError: if checkpoints are there and none can be read, or it does not fit.
         """
         self._folder = CheckpointFolder(run.folder_for(self) / CHECKPOINTS)
         self._data = fingerprint(run.frames)
-        if not run.resume:
-            return
-        content = run.processes.from_first(lambda: self._folder.read(max_bytes(run)))
+        content = None
+        if run.resume:
+            content = run.processes.from_first(lambda: self._folder.read(max_bytes(run)))
         if content is not None:
             restore_run(run, content, self._folder.folder, self._data)
             logger.info("continuing after step %d", run.step)
+        elif run.step and run.processes.is_first:  # what was done before this run began is kept, too
+            self._folder.save(run.step, encode_run(run, self._data))
 
     def on_step_end(self, run: Run) -> None:
         """Write a checkpoint when it is time, at the end, and after a signal to stop.

@@ -4,18 +4,18 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from signal import Signals
 from typing import cast
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dnerf.core.checks import check_positive, check_whole
 from dnerf.data.frames import Frames
-from dnerf.data.pixel_samplers import PixelSampler, UniformPixels
+from dnerf.data.pixel_samplers import FrameSubset, PixelSampler, UniformPixels
 from dnerf.losses import Loss, PhotometricLoss
 from dnerf.nn.encodings import FrameTimesAware
 from dnerf.rendering.cuda_graphs import GraphCache
@@ -23,6 +23,7 @@ from dnerf.rendering.renderer import Renderer, has_fixed_capacity
 from dnerf.samplers import Capacity
 from dnerf.training.callbacks import Callback
 from dnerf.training.distributed import Processes
+from dnerf.training.inheritance import take_over
 from dnerf.training.optimizer import AdamSettings
 from dnerf.training.records import Limits, TrainingRecord, not_finite
 from dnerf.training.run import Run
@@ -103,6 +104,7 @@ class Trainer:
         folder: str | Path | None = None,
         resume: bool = False,
         processes: Processes | None = None,
+        begun: Run | None = None,
     ) -> TrainingRecord:
         """Train in place; the last step's record.
 
@@ -116,6 +118,7 @@ class Trainer:
             resume: continue from the newest checkpoint in the folder, if there is one, exactly as if training had never
                 stopped; needs a callback that does so, `Checkpoints`.
             processes: those that train together; None for this one alone.
+            begun: a run whose first steps are done already, by a model of the same parts; None for a fresh one.
 
         Raises:
             FloatingPointError: naming step and tensors, when the loss is not finite.
@@ -124,13 +127,39 @@ class Trainer:
             MemoryError: saying what to lower, when a GPU's memory does not suffice.
             OSError: if the last checkpoint cannot be written.
         """
+        run = self.begin(renderer, frames, seed=seed, folder=folder, resume=resume, processes=processes)
+        if begun is not None:
+            take_over(run, begun)
+        run.callbacks = self.callbacks
+        for callback in self.callbacks.values():
+            callback.on_train_begin(run)
+        run.num_rays = max(run.num_rays, run.processes.size)
+        catching = nullcontext(StopRequest()) if folder is None else stop_requests()
+        with catching as request, run.processes.watched(), _advice_on_memory(run):
+            self.advance(run, lambda: self.limits.is_finished(run.step, run.seconds), request)
+        renderer.set_progress(1.0)
+        renderer.eval()
+        self._notify("on_train_end", run)
+        assert run.last_record is not None
+        return run.last_record
+
+    def begin(
+        self,
+        renderer: Renderer,
+        frames: Frames,
+        *,
+        seed: int = 0,
+        folder: str | Path | None = None,
+        resume: bool = False,
+        processes: Processes | None = None,
+    ) -> Run:
+        """A run before its first step, without callbacks; arguments and errors as of `fit`."""
         self.losses.load_state_dict(self._losses_at_first, strict=False)  # what they count begins anew, too
         run = Run(
             renderer, frames.to(renderer.device), self.optimizer.build(renderer),
             torch.Generator(renderer.device).manual_seed(seed), self.losses.to(renderer.device),
-            self.pixels.to(renderer.device), self.callbacks, processes or Processes(),
-            None if folder is None else Path(folder), resume,
-            num_rays=self.num_rays, most_rays=max(self.num_rays, self.max_rays),
+            self.pixels.to(renderer.device), {}, processes or Processes(), None if folder is None else Path(folder),
+            resume, num_rays=self.num_rays, most_rays=max(self.num_rays, self.max_rays),
         )  # fmt: skip
         self._check(run)
         renderer.train()
@@ -139,23 +168,22 @@ class Trainer:
                 part.see(run.frames.times)
         self.pixels.begin(run.frames)
         warm_up(renderer, run.frames)
-        for callback in self.callbacks.values():
-            callback.on_train_begin(run)
-        run.num_rays = max(run.num_rays, run.processes.size)
-        catching = nullcontext(StopRequest()) if folder is None else stop_requests()
-        with catching as request, run.processes.watched(), _advice_on_memory(run):
-            stepper = self._stepper(run)
-            while not self.limits.is_finished(run.step, run.seconds):
-                self._turn(run, stepper, request)
-                if run.signal and not run.ends:
-                    saved = "all" if any(x.is_required for x in self.callbacks.values()) else "nothing"
-                    said = f"stopped by {Signals(run.signal).name} after step {run.step}, {saved} saved"
-                    raise TrainingStopped(run.signal, said)
-        renderer.set_progress(1.0)
-        renderer.eval()
-        self._notify("on_train_end", run)
-        assert run.last_record is not None
-        return run.last_record
+        return run
+
+    def frames_in(self, progress: float) -> Tensor | None:
+        """Numbers (n,) of the frames that pixels are drawn from at a progress in [0, 1]; None for all."""
+        return self.pixels.frames_in(progress) if isinstance(self.pixels, FrameSubset) else None
+
+    def advance(self, run: Run, is_done: Callable[[], bool], request: StopRequest | None = None) -> None:
+        """Take steps of a run, one of `begin` or `fit`, until `is_done` says so; TrainingStopped after a signal."""
+        request = StopRequest() if request is None else request
+        stepper = self._stepper(run)
+        while not is_done():
+            self._turn(run, stepper, request)
+            if run.signal and not run.ends:
+                saved = "all" if any(x.is_required for x in run.callbacks.values()) else "nothing"
+                said = f"stopped by {Signals(run.signal).name} after step {run.step}, {saved} saved"
+                raise TrainingStopped(run.signal, said)
 
     def _check(self, run: Run) -> None:
         """Raise unless every part finds what it needs."""
@@ -220,7 +248,7 @@ class Trainer:
 
     def _notify(self, event: str, run: Run) -> None:
         """Call all callbacks; one that cannot write loses its output, and the run only if it is required."""
-        for callback in self.callbacks.values():
+        for callback in run.callbacks.values():
             try:
                 getattr(callback, event)(run)
             except OSError as error:
@@ -233,7 +261,7 @@ class Trainer:
         mse, opacity, contrast = (numbers.pop(name) for name in ("mse", "opacity", "contrast"))
         psnr = -10 * math.log10(max(mse, 1e-12))
         record = TrainingRecord(run.step, run.seconds, numbers, psnr, rays, samples, factor, opacity, contrast)
-        if (broken := record.broken()) and not any(callback.handles_failures for callback in self.callbacks.values()):
+        if (broken := record.broken()) and not any(callback.handles_failures for callback in run.callbacks.values()):
             parameters, losses = ", ".join(not_finite(run.renderer)) or "none", ", ".join(broken)
             raise FloatingPointError(f"step {run.step}: {losses} not finite; parameters not finite: {parameters}")
         return record

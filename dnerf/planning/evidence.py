@@ -1,0 +1,73 @@
+"""What images alone say about a scene, before any training."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+
+from dnerf.core.geometry import ray_box
+from dnerf.data.bounds import fit_box
+from dnerf.data.carving import Silhouettes
+from dnerf.data.frames import Frames
+
+MAX_RAYS = 1000  # of outlines
+MAX_VIEWS = 60  # evenly spread
+NUM_DISTANCES = 64  # along each ray
+REACH = 1  # blocks of pixels by which outlines may be off
+NOT_CLEAR = 2  # alpha, of 255, from which a pixel shows something, be it fog
+AGREEMENT = 0.98  # share of the views in which one position is not empty, so that a body at rest explains a ray
+CLEAR_SHARE = 0.01  # of rays without such a position: fewer may be faults of single images
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found, and why."""
+
+    choice: str  # name of a candidate
+    why: str  # in a few words
+    is_certain: bool = True  # otherwise it stands until a trial says something else
+
+
+class Evidence(ABC):
+    """Looks at the training frames and may decide a part."""
+
+    @abstractmethod
+    def find(self, frames: Frames) -> Finding | None:
+        """What the images say; None where they do not decide."""
+
+
+class MotionEvidence(Evidence):
+    """Whether anything moves: candidates "still" and "moves".
+
+    Frames of one time show nothing moving. Otherwise silhouettes can prove motion: at rest, every opaque pixel shows a
+    position that no other view sees as empty (the visual hull, Laurentini 1994). That they agree does not prove rest,
+    since a body may turn inside its outline, but rest stands until a trial says otherwise.
+    """
+
+    def find(self, frames: Frames) -> Finding | None:
+        """See `Evidence.find`."""
+        if len(frames.times.unique()) == 1:
+            return Finding("still", "all frames have one time")
+        if not frames.is_transparent:
+            return None
+        share = unexplained_share(frames)
+        if share <= CLEAR_SHARE:
+            return Finding("still", "all outlines agree with a body at rest", is_certain=False)
+        return Finding("moves", f"{100 * share:.0f} % of the outlines contradict a body at rest")
+
+
+def unexplained_share(frames: Frames) -> float:
+    """The share of outlines' rays without a position that nearly all views see as not empty."""
+    chosen = torch.linspace(0, len(frames) - 1, min(len(frames), MAX_VIEWS)).round().long().tolist()
+    views = frames.subset(chosen) if len(chosen) < len(frames) else frames
+    rays = Silhouettes.of(views).outlines()[1]
+    enter, leave = ray_box(rays.origins, rays.directions, fit_box(frames))
+    enter, leave = enter.maximum(rays.near), leave.minimum(rays.far)
+    kept = (enter < leave).nonzero()[:, 0]
+    kept = kept[:: max(1, -(-len(kept) // MAX_RAYS))]
+    if not len(kept):
+        return 0.0
+    steps = (torch.arange(NUM_DISTANCES, device=kept.device) + 0.5) / NUM_DISTANCES
+    distances = enter[kept, None] + (leave - enter)[kept, None] * steps
+    seen = Silhouettes.of(views, NOT_CLEAR).share_of_views(rays[kept], distances, REACH)
+    return float((seen.amax(1) < AGREEMENT).float().mean())

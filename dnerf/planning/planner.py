@@ -1,0 +1,144 @@
+"""Deciding what a scene needs: settings, then images, then trials, for at most a share of the training's budget."""
+
+import logging
+import math
+import time
+from collections.abc import Mapping
+
+from dnerf.data.frames import Frames
+from dnerf.planning.evidence import Finding
+from dnerf.planning.parts import Part
+from dnerf.planning.plan import Decision, Plan, fingerprint
+from dnerf.planning.trials import Contender, Effort, HeldOut, Maker, contest, split_frames
+from dnerf.training.run import Run
+
+logger = logging.getLogger(__name__)
+
+LEAST_STEPS = 8  # of a trial: fewer tell nothing
+MOST_STEPS = 400  # more tell nothing new
+
+
+def make_plan(
+    parts: Mapping[str, Part],
+    given: Mapping[str, str],
+    make: Maker,
+    frames: Frames,
+    *,
+    seed: int = 0,
+    share: float = 0.1,
+) -> tuple[Plan, Run | None]:
+    """Decide every part, and the run that the trials' winner has begun.
+
+    Parts are decided one after the other, in the order of when they are tried. Candidates go on from the weights of the
+    model decided so far, train for the same time (or steps, if that is what ends training), and are compared on held-out
+    frames; the loser's time counts as training time. All of it takes at most a share of the budget.
+
+    Args:
+        parts: by name.
+        given: choices that stand already, by part.
+        make: builds model and trainer for choices by part.
+        frames: the training split.
+        seed: of the trials' draws.
+        share: of the training's seconds, or steps, for trials.
+
+    Returns:
+        plan: decisions for all parts.
+        run: of the model that `make` builds for them, some steps in; None if no trial was needed.
+    """
+    return _Planner(parts, given, make, frames, seed, share).decide()
+
+
+class _Planner:
+    def __init__(
+        self, parts: Mapping[str, Part], given: Mapping[str, str], make: Maker, frames: Frames, seed: int, share: float
+    ) -> None:
+        self.parts, self.make, self.frames, self.seed, self.share = parts, make, frames, seed, share
+        self.decisions: dict[str, Decision] = {}
+        self.standing = {name: Finding(part.default, "") for name, part in parts.items()}
+        self.leading: Contender | None = None
+        for name in sorted(parts, key=lambda name: parts[name].at):
+            self._without_training(name, given.get(name))
+        self.tried = [name for name in sorted(parts, key=lambda name: parts[name].at) if name not in self.decisions]
+
+    def _without_training(self, name: str, given: str | None) -> None:
+        part = self.parts[name]
+        begin = time.perf_counter()
+        if given is not None:
+            self.decisions[name] = Decision(given, "given", "as set")
+        elif not part.arises(self._choices()):
+            self.decisions[name] = Decision(next(iter(part.candidates)), "default", "the question does not arise")
+        elif part.evidence is not None and (finding := part.evidence.find(self.frames)) is not None:
+            seconds = time.perf_counter() - begin
+            if finding.is_certain:
+                self.decisions[name] = Decision(finding.choice, "images", finding.why, seconds=seconds)
+            else:
+                self.standing[name] = finding
+
+    def _choices(self) -> dict[str, str]:
+        """Those made, and defaults for all others."""
+        defaults = {name: finding.choice for name, finding in self.standing.items()}
+        return defaults | {name: decision.choice for name, decision in self.decisions.items()}
+
+    def decide(self) -> tuple[Plan, Run | None]:
+        """See `make_plan`."""
+        halves = split_frames(self.frames)
+        for number, name in enumerate(self.tried):
+            part = self.parts[name]
+            if not part.arises(self._choices()):
+                simplest = next(iter(part.candidates))
+                self.decisions[name] = Decision(simplest, "default", "the question does not arise")
+            elif halves is None:
+                self.decisions[name] = self._untried(name, f"{len(self.frames)} frames are too few to try")
+            else:
+                self._try(name, *halves, num_left=len(self.tried) - number)
+        plan = Plan({name: self.decisions[name] for name in self.parts}, fingerprint(self.frames))
+        return plan, None if self.leading is None else self.leading.run
+
+    def _try(self, name: str, learnt: Frames, held: Frames, num_left: int) -> None:
+        part, choices = self.parts[name], self._choices()
+        leading = self._leading(learnt, choices, part.at)
+        effort = self._effort(leading, len(part.candidates) - 1, num_left)
+        if effort.num_steps < LEAST_STEPS:
+            self.decisions[name] = self._untried(name, "the budget is too small to try")
+            return
+        standing = self.standing[name].choice
+        others = [choice for choice in part.candidates if choice != standing]
+        leading.choice = standing
+        contenders = [leading]
+        for choice in others:
+            contenders.append(leading.forked(choice, self.make, {**choices, name: choice}, learnt, self.seed))
+        before = [contender.run.seconds for contender in contenders]
+        result = contest(contenders, HeldOut.of(held, self.seed), effort)
+        winner, better, error = result.winner, result.gain, result.error
+        spent = (c.run.seconds - b for c, b in zip(contenders, before, strict=True) if c is not winner)
+        lost = result.seconds + sum(spent)
+        second = "the others" if len(contenders) > 2 else next(c.choice for c in contenders if c is not winner)
+        why = f"{effort.num_steps} steps, on held-out pixels, against {second}"
+        finite = {"gain": better, "error": error} if math.isfinite(better) else {}
+        self.decisions[name] = Decision(winner.choice, "trial", why, seconds=lost, **finite)
+        winner.run.seconds += lost
+        self.leading = winner
+
+    def _untried(self, name: str, why: str) -> Decision:
+        standing = self.standing[name]
+        by = "images" if standing.why else "default"
+        return Decision(standing.choice, by, f"{standing.why}; {why}" if standing.why else why)
+
+    def _leading(self, learnt: Frames, choices: Mapping[str, str], at: float) -> Contender:
+        """The model decided so far, trained until a progress."""
+        if self.leading is None:
+            self.leading = Contender.fresh("", self.make, choices, learnt, self.seed)
+        run, limits = self.leading.run, self.leading.trainer.limits
+        self.leading.trainer.advance(run, lambda: limits.progress(run.step, run.seconds) >= at)
+        return self.leading
+
+    def _effort(self, leading: Contender, num_others: int, num_left: int) -> Effort:
+        """What each candidate may spend for the budget's share to suffice."""
+        limits, run = leading.trainer.limits, leading.run
+        if limits.max_seconds is None:
+            return Effort(min(int(self.share * limits.num_steps / num_left / num_others), MOST_STEPS), 0.0)
+        each = run.seconds / run.step
+        spent = sum(decision.seconds for decision in self.decisions.values() if decision.by == "trial")
+        budget = (self.share * limits.max_seconds - spent) / num_left
+        num_steps = min(int(budget / num_others / each), MOST_STEPS)
+        return Effort(num_steps, num_steps * each)

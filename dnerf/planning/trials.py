@@ -1,0 +1,176 @@
+"""Candidates trained against each other from the same weights, and compared on frames that none has seen."""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dnerf.data.frames import Frames, composite_on
+from dnerf.rendering.renderer import Renderer
+from dnerf.training.inheritance import take_over
+from dnerf.training.run import Run
+from dnerf.training.trainer import Trainer
+
+Maker = Callable[[Mapping[str, str]], tuple[Renderer, Trainer]]
+"""The model and the trainer for choices of candidates by part."""
+
+HELD_SHARE = 0.125  # of the frames
+LEAST_FRAMES = 8  # of the training split, below which none is held out
+NUM_RAYS = 8192  # of a comparison
+STANDARD_ERRORS = 2.0  # by which a candidate must be better than the one that stands
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What each candidate may spend: seconds where training is limited by them, so that a part must earn what it costs,
+    else steps."""
+
+    num_steps: int
+    seconds: float  # that so many steps of the model that stands take
+
+    def divided(self, number: int) -> "Effort":
+        """One of so many equal parts."""
+        return Effort(max(1, self.num_steps // number), self.seconds / number)
+
+
+class Contender:
+    """One candidate in training."""
+
+    def __init__(self, choice: str, trainer: Trainer, run: Run) -> None:
+        self.choice, self.trainer, self.run = choice, trainer, run
+        self.errors = torch.empty(0)  # (F,) mean squared, of each held-out frame
+
+    @classmethod
+    def fresh(cls, choice: str, make: Maker, choices: Mapping[str, str], frames: Frames, seed: int) -> "Contender":
+        """One from scratch."""
+        renderer, trainer = make(choices)
+        return cls(choice, trainer, trainer.begin(renderer, frames, seed=seed))
+
+    def forked(self, choice: str, make: Maker, choices: Mapping[str, str], frames: Frames, seed: int) -> "Contender":
+        """Another candidate that goes on from where this one stands."""
+        other = Contender.fresh(choice, make, choices, frames, seed)
+        take_over(other.run, self.run)
+        return other
+
+    def advance(self, effort: "Effort") -> None:
+        """Take steps until the effort is spent, or training ends."""
+        run, limits = self.run, self.trainer.limits
+        step, seconds = run.step + effort.num_steps, run.seconds + effort.seconds
+
+        def is_done() -> bool:
+            enough = run.step >= step if limits.max_seconds is None else run.seconds >= seconds
+            return enough or limits.is_finished(run.step, run.seconds)
+
+        self.trainer.advance(run, is_done)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Pixels of frames that trials do not train on."""
+
+    frames: Frames
+    indices: Tensor  # (F, P) int64, pixels of each frame
+
+    @classmethod
+    def of(cls, frames: Frames, seed: int) -> "HeldOut":
+        """The same number of random pixels of each frame."""
+        generator = torch.Generator().manual_seed(seed)
+        size = frames.num_pixels // len(frames)
+        pixels = torch.randint(size, (len(frames), max(1, NUM_RAYS // len(frames))), generator=generator)
+        return cls(frames, pixels + size * torch.arange(len(frames))[:, None])
+
+    def within(self, times: Tensor) -> "HeldOut":
+        """Those frames whose times lie between the first and the last of some; all, if fewer than two do."""
+        own = self.frames.times[self.indices[:, 0] // (self.frames.num_pixels // len(self.frames))]
+        kept = ((own >= times.min()) & (own <= times.max())).nonzero()[:, 0]
+        return self if len(kept) < 2 else HeldOut(self.frames, self.indices[kept])
+
+    @torch.no_grad()
+    def errors(self, renderer: Renderer) -> Tensor:
+        """Mean squared errors (F,) of the frames, rendered as training does; the same draws at every call."""
+        rays, rgba = self.frames.pixels(self.indices.flatten().to(renderer.device))
+        generator = torch.Generator(renderer.device).manual_seed(0)
+        rendering = renderer(rays, generator=generator)
+        assert rendering.background is not None
+        squares = (rendering.rgb - composite_on(rgba, rendering.background)).square().mean(-1)
+        return squares.view(self.indices.shape).double().mean(1).cpu()
+
+
+def split_frames(frames: Frames) -> tuple[Frames, Frames] | None:
+    """Frames to train on and frames to compare on, evenly spread in time; None if there are too few."""
+    if len(frames) < LEAST_FRAMES:
+        return None
+    every = round(1 / HELD_SHARE)
+    order = frames.times.argsort(stable=True).tolist()
+    held = order[every // 2 :: every]
+    return frames.subset([i for i in range(len(frames)) if i not in set(held)]), frames.subset(held)
+
+
+def gain(better: Tensor, worse: Tensor) -> tuple[float, float]:
+    """By how much some errors (F,) are smaller than others, in dB, and the standard error of that.
+
+    The frames are taken as independent, their differences as paired: what both candidates find hard does not count.
+    """
+    if not bool(better.isfinite().all()):
+        return -math.inf, 0.0
+    if not bool(worse.isfinite().all()):
+        return math.inf, 0.0
+    differences = 10 * (worse.clamp(min=1e-12) / better.clamp(min=1e-12)).log10()
+    share = worse / worse.sum().clamp(min=1e-30)  # of the whole error: a frame without any says nothing
+    mean = float((share * differences).sum())
+    spread = float((share.square() * (differences - mean).square()).sum().sqrt())
+    return mean, spread
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a contest came to."""
+
+    winner: Contender
+    gain: float  # over the second, in dB
+    error: float  # standard error of that
+    seconds: float  # that comparisons took
+
+
+def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> Result:
+    """Train all, halving their number until one is left.
+
+    The first contender is the one that stands: another one wins only if it is better by two standard errors.
+
+    Args:
+        contenders: at least two, the default first.
+        held: what they are compared on.
+        effort: of each until the last comparison, in as many rounds as there are halvings.
+    """
+    left, seconds = list(contenders), 0.0
+    num_rounds = max(1, math.ceil(math.log2(len(left))))
+    for _ in range(num_rounds):
+        for contender in left:
+            contender.advance(effort.divided(num_rounds))
+        begin = time.perf_counter()
+        inside = held
+        for contender in left:
+            inside = inside.within(_times_in(contender))
+        for contender in left:
+            contender.errors = inside.errors(contender.run.renderer)
+        seconds += time.perf_counter() - begin
+        if len(left) > 2:
+            left = sorted(left, key=lambda c: float(c.errors.mean()))[: (len(left) + 1) // 2]
+    standing = contenders[0]
+    best = min(left, key=lambda c: float(c.errors.mean()))
+    if best is not standing:
+        mean, error = gain(best.errors, standing.errors)
+        if mean > STANDARD_ERRORS * error:
+            return Result(best, mean, error, seconds)
+        return Result(standing, -mean, error, seconds)
+    second = min((c for c in left if c is not standing), key=lambda c: float(c.errors.mean()))
+    return Result(standing, *gain(standing.errors, second.errors), seconds)
+
+
+def _times_in(contender: Contender) -> Tensor:
+    """Times of the frames that training has seen."""
+    run, frames_in = contender.run, contender.trainer.frames_in(contender.run.progress)
+    return run.frames.times if frames_in is None else run.frames.times[frames_in]

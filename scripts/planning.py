@@ -1,0 +1,101 @@
+"""What `experiment=auto` trains: parts and choices from the config, and models for them."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra_app import build, resolved
+from omegaconf import DictConfig, OmegaConf
+
+from dnerf.data.frames import Frames
+from dnerf.planning import Part, Plan, make_plan
+from dnerf.planning.plan import FILE, fingerprint, load_plan
+from dnerf.rendering.renderer import Renderer
+from dnerf.training.run import Run
+from dnerf.training.trainer import Trainer
+
+OVERRIDES = "overrides.json"  # in a run's folder
+SETTINGS = ("parts", "share", "file")  # of a plan; all others are choices
+
+
+def parts_of(config: DictConfig) -> dict[str, Part]:
+    """The parts about which something is to be decided; none without a plan."""
+    node = OmegaConf.select(config, "plan.parts")
+    return {} if node is None else {str(name): build(part, trusted=True) for name, part in node.items()}
+
+
+def given_choices(config: DictConfig, parts: Mapping[str, Part], data: str, folder: Path) -> dict[str, str]:
+    """What is decided already: by the command line, or by a saved plan.
+
+    Raises:
+        ValueError: for a part or a candidate that there is not, or a plan of another data set.
+    """
+    plan: Any = config.plan
+    given = {str(name): value for name, value in plan.items() if name not in SETTINGS and value is not None}
+    if plan.file is not None:
+        saved = load_plan(Path(plan.file))
+        if saved.data and saved.data != data:
+            raise ValueError(f"plan.file: {plan.file} is about another data set; leave it out, or the line data in it")
+        given = {**saved.choices, **given}
+    for name in given.keys() - parts.keys():
+        raise ValueError(f"plan.{name} is none of the parts {', '.join(parts)}")
+    choices = {name: parts[name].named(name, value) for name, value in given.items()}
+    touched = {_key(override) for override in given_overrides(folder)}
+    for name, part in parts.items():
+        defining = {_key(overrides[0]) for overrides in part.candidates.values() if overrides}
+        if name not in choices and defining & touched:
+            choices[name] = part.default  # what the command line says of it stands
+    return choices
+
+
+def given_overrides(folder: Path) -> list[str]:
+    """The command line's, of the run that began in a folder."""
+    path = folder / OVERRIDES
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else list(HydraConfig.get().overrides.task)
+
+
+def as_decided(config: DictConfig, folder: Path, box: Any) -> DictConfig:
+    """The config, in a box, with what was decided when the run in a folder began; as it is, if nothing was."""
+    parts = parts_of(config)
+    if not parts or not (folder / FILE).is_file():
+        return config
+    saved = load_plan(folder / FILE).choices
+    choices = {name: part.named(name, saved.get(name, part.default)) for name, part in parts.items()}
+    return composed(parts, choices, box, list(HydraConfig.get().overrides.task))
+
+
+def composed(parts: Mapping[str, Part], choices: Mapping[str, str], box: Any, task: Sequence[str]) -> DictConfig:
+    """The resolved config of a training run with some choices, as overrides and the box have it otherwise."""
+    chosen = [override for name, part in parts.items() for override in part.candidates[choices[name]]]
+    mine = {_key(override) for override in task}
+    config = compose("train", [*(x for x in chosen if _key(x) not in mine), *task])
+    if box is not None:
+        config.data.box = box
+    config = resolved(config)
+    config.pop("plan", None)
+    return config
+
+
+def decide(
+    config: DictConfig, parts: Mapping[str, Part], frames: Frames, device: torch.device, folder: Path
+) -> tuple[Plan, Run | None]:
+    """The plan, and what its trials have begun; ValueError as of `given_choices`."""
+    given = given_choices(config, parts, fingerprint(frames), folder)
+    box = OmegaConf.to_container(config.data.box) if "box" in config.data else None
+
+    def make(choices: Mapping[str, str]) -> tuple[Renderer, Trainer]:
+        candidate = composed(parts, choices, box, given_overrides(folder))
+        torch.manual_seed(candidate.seed)
+        return build(candidate.renderer, trusted=True).to(device), build(candidate.trainer, trusted=True)
+
+    return make_plan(parts, given, make, frames, seed=config.seed, share=config.plan.share)
+
+
+def _key(override: str) -> str:
+    parsed = OverridesParser.create().parse_override(override)
+    return parsed.get_key_element().lstrip("+~").partition("@")[0]

@@ -1,0 +1,178 @@
+"""What a scene needs: evidence of images, contests of candidates, decisions, and how they are kept."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_runs import small_frames, small_renderer, small_trainer, weights
+
+from dnerf.data import Frames, SyntheticData
+from dnerf.planning import Decision, Evidence, Finding, MotionEvidence, Part, Plan, make_plan
+from dnerf.planning.plan import fingerprint, load_plan
+from dnerf.planning.planner import LEAST_STEPS
+from dnerf.planning.trials import Contender, Effort, HeldOut, contest, gain, split_frames
+from dnerf.rendering import Renderer
+from dnerf.scenes import make_scene
+from dnerf.training import AdamSettings, Trainer
+
+CANDIDATES = {"slow": [], "quick": ["a.b=1"]}
+
+
+def frames_of(scene: str, num_frames: int = 24, size: int = 64) -> Frames:
+    return SyntheticData(make_scene(scene), size, num_train=num_frames).frames("train")
+
+
+@pytest.mark.parametrize("scene", ["walker", "orbiting_balls", "snowman", "merging_balls"])
+def test_silhouettes_prove_motion(scene: str) -> None:
+    finding = MotionEvidence().find(frames_of(scene))
+    assert finding is not None
+    assert (finding.choice, finding.is_certain) == ("moves", True)
+
+
+def test_silhouettes_of_a_body_at_rest_leave_it_at_rest_until_a_trial() -> None:
+    finding = MotionEvidence().find(frames_of("static"))
+    assert finding is not None
+    assert (finding.choice, finding.is_certain) == ("still", False)
+
+
+def test_frames_of_one_time_are_still_for_certain_and_opaque_ones_tell_nothing() -> None:
+    frames = frames_of("walker", 8, 16)
+    still = MotionEvidence().find(replace(frames, times=torch.full_like(frames.times, 0.25)))
+    assert still is not None
+    assert (still.choice, still.is_certain) == ("still", True)
+    opaque = replace(frames, images=frames.images[..., :3].contiguous())
+    assert MotionEvidence().find(opaque) is None
+
+
+def test_gain_is_the_ratio_of_whole_errors_for_equal_ratios_and_has_no_spread_then() -> None:
+    worse = torch.tensor([0.1, 0.02, 0.3], dtype=torch.float64)
+    mean, error = gain(worse / 2, worse)
+    assert mean == pytest.approx(10 * math.log10(2))
+    assert error == pytest.approx(0)
+    assert gain(torch.tensor([math.nan]), worse[:1]) == (-math.inf, 0.0)
+    assert gain(worse[:1], torch.tensor([math.inf])) == (math.inf, 0.0)
+
+
+def test_gain_of_noise_is_within_two_standard_errors_nearly_always() -> None:
+    generator = torch.Generator().manual_seed(0)
+    counts = 0
+    for _ in range(400):
+        first, second = (1 + 0.2 * torch.rand(2, 16, generator=generator, dtype=torch.float64)).unbind()
+        mean, error = gain(first, second)
+        counts += mean > 2 * error
+    assert counts / 400 < 0.06  # 2.3 % of normal ones; sixteen frames have somewhat heavier tails
+
+
+def test_split_holds_every_eighth_frame_out_and_none_of_few() -> None:
+    frames = small_frames(24)
+    learnt, held = split_frames(frames)  # type: ignore[misc]
+    assert (len(learnt), len(held)) == (21, 3)
+    assert not set(learnt.times.tolist()) & set(held.times.tolist())
+    assert split_frames(small_frames(7)) is None
+
+
+def make(choices: Mapping[str, str]) -> tuple[Renderer, Trainer]:
+    """A model that learns at two rates."""
+    rates = {"slow": 1e-6, "quick": 2e-2, "worse": 1e-7}
+    settings = AdamSettings({"default": rates[choices.get("rate", "slow")]})
+    return small_renderer(), small_trainer(num_steps=200, num_rays=64, optimizer=settings)
+
+
+def test_fork_continues_from_the_same_weights_and_moments() -> None:
+    frames = small_frames(8)
+    leading = Contender.fresh("slow", make, {}, frames, 0)
+    leading.advance(Effort(4, 0.0))
+    fork = leading.forked("quick", make, {"rate": "quick"}, frames, 0)
+    torch.testing.assert_close(weights(fork.run.renderer), weights(leading.run.renderer), rtol=0, atol=0)
+    assert (fork.run.step, fork.run.seconds) == (leading.run.step, leading.run.seconds)
+    for left, right in zip(fork.run.renderer.parameters(), leading.run.renderer.parameters(), strict=True):
+        for key, moment in leading.run.optimizer.state[right].items():
+            torch.testing.assert_close(fork.run.optimizer.state[left][key], moment, rtol=0, atol=0)
+    before = weights(leading.run.renderer)
+    fork.advance(Effort(2, 0.0))
+    torch.testing.assert_close(weights(leading.run.renderer), before, rtol=0, atol=0)
+
+
+def test_contest_finds_the_candidate_that_learns_and_keeps_the_standing_one_of_equals() -> None:
+    learnt, held = split_frames(small_frames(24))  # type: ignore[misc]
+    pixels = HeldOut.of(held, 0)
+
+    def contenders(*rates: str) -> list[Contender]:
+        return [Contender.fresh(rate, make, {"rate": rate}, learnt, 0) for rate in rates]
+
+    result = contest(contenders("slow", "quick", "worse"), pixels, Effort(40, 0.0))
+    assert result.winner.choice == "quick"
+    assert result.gain > 2 * result.error > 0
+    assert contest(contenders("slow", "slow"), pixels, Effort(10, 0.0)).winner.choice == "slow"
+
+
+def part(**changes: object) -> Part:
+    return Part("how fast", CANDIDATES, "slow", **{"at": 0.1, **changes})  # type: ignore[arg-type]
+
+
+def test_trial_decides_and_its_winner_is_trained_on() -> None:
+    plan, run = make_plan({"rate": part()}, {}, make, small_frames(24), share=0.3)
+    decision = plan.decisions["rate"]
+    assert (decision.choice, decision.by) == ("quick", "trial")
+    assert run is not None
+    assert run.step >= 20 + LEAST_STEPS
+    renderer, trainer = make(plan.choices)
+    record = trainer.fit(run.renderer, small_frames(24), begun=run)
+    assert record.step == 200
+    assert run.renderer is not renderer
+
+
+def test_nothing_is_trained_for_what_is_given_seen_cannot_be_tried_or_does_not_arise() -> None:
+    class Sees(Evidence):
+        def find(self, frames: Frames) -> Finding:
+            return Finding("quick", "one sees it")
+
+    parts = {"given": part(), "seen": part(evidence=Sees()), "other": part(only_if={"seen": "slow"})}
+    plan, run = make_plan(parts, {"given": "quick"}, make, small_frames(24))
+    assert run is None
+    assert plan.choices == {"given": "quick", "seen": "quick", "other": "slow"}
+    assert [plan.decisions[name].by for name in parts] == ["given", "images", "default"]
+    plan, run = make_plan({"rate": part()}, {}, make, small_frames(6))
+    assert run is None
+    assert "too few" in plan.decisions["rate"].why
+    plan, _ = make_plan({"rate": part()}, {}, make, small_frames(24), share=0.001)
+    assert "budget" in plan.decisions["rate"].why
+
+
+def test_uncertain_evidence_stands_where_nothing_is_tried() -> None:
+    class Guesses(Evidence):
+        def find(self, frames: Frames) -> Finding:
+            return Finding("quick", "it looks so", is_certain=False)
+
+    plan, _ = make_plan({"rate": part(evidence=Guesses())}, {}, make, small_frames(6))
+    assert (plan.choices["rate"], plan.decisions["rate"].by) == ("quick", "images")
+
+
+def test_plan_is_read_as_it_was_saved_and_by_hand(tmp_path: Path) -> None:
+    plan = Plan({"rate": Decision("quick", "trial", "9 steps", 0.5, 0.1, 1.5)}, fingerprint(small_frames()))
+    plan.save(tmp_path / "plan.yaml")
+    assert load_plan(tmp_path / "plan.yaml") == plan
+    assert "quick" in plan.table()
+    assert "+0.50 ± 0.10" in plan.table()
+    (tmp_path / "plan.yaml").write_text("parts: {rate: quick, other: true}")
+    assert load_plan(tmp_path / "plan.yaml").choices == {"rate": "quick", "other": "true"}
+
+
+@pytest.mark.parametrize("text", ["parts: 3", "parts: {rate: {by: trial}}", "parts: {rate: {choice: a, foo: 1}}", "]["])
+def test_broken_plans_are_refused_naming_the_file(tmp_path: Path, text: str) -> None:
+    (tmp_path / "plan.yaml").write_text(text)
+    with pytest.raises(ValueError, match=r"plan\.file: .*plan\.yaml"):
+        load_plan(tmp_path / "plan.yaml")
+
+
+def test_part_names_its_candidates() -> None:
+    assert [part().named("rate", choice) for choice in ("slow", True, False)] == ["slow", "quick", "slow"]
+    with pytest.raises(ValueError, match=r"plan\.rate must be one of slow, quick, true, false or null, got 'swift'"):
+        part().named("rate", "swift")
+    with pytest.raises(ValueError, match="default"):
+        Part("", CANDIDATES, "swift")
+    with pytest.raises(ValueError, match="candidates"):
+        Part("", {"slow": []}, "slow")
