@@ -93,7 +93,9 @@ def decide(
         torch.manual_seed(candidate.seed)
         return build(candidate.renderer, trusted=True).to(device), build(candidate.trainer, trusted=True)
 
-    return make_plan(parts, given, make, frames, seed=config.seed, share=config.plan.share)
+    watching = {name: config.trainer.callbacks.get(name) for name in ("recovery", "progress_bar")}
+    callbacks = {name: build(node, trusted=True) for name, node in watching.items() if node is not None}
+    return make_plan(parts, given, make, frames, seed=config.seed, share=config.plan.share, callbacks=callbacks)
 
 
 def _key(override: str) -> str:

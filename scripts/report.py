@@ -9,6 +9,8 @@ from omegaconf import DictConfig
 
 from dnerf.core.files import write_text
 from dnerf.evaluation.report import read_scores, write_report_text
+from dnerf.planning.plan import FILE as PLAN
+from dnerf.planning.plan import load_plan
 from dnerf.visualization import OUTPUTS
 
 SHEETS = (
@@ -43,6 +45,7 @@ def main(config: DictConfig) -> None:
         films=films,
         sheets=sheets,
         temporal=_temporal(folder / "temporal.json"),
+        plan=load_plan(folder / PLAN).rows() if (folder / PLAN).is_file() else [],
     )
     output = Path(config.output or folder / "report.html")
     write_text(output, text)

@@ -49,6 +49,17 @@ def parts(*overrides: str) -> tuple[Any, Any, Any]:
     return tuple(built(composed(*overrides), name) for name in ("data", "renderer", "trainer"))
 
 
+PARTS = OmegaConf.to_container(composed("experiment=auto").plan.parts)
+CANDIDATES = [(part, name) for part, node in PARTS.items() for name in node["candidates"]]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("part", "candidate"), CANDIDATES, ids=lambda word: word)
+def test_every_candidate_of_the_plan_instantiates_and_takes_a_step(part: str, candidate: str) -> None:
+    overrides = PARTS[part]["candidates"][candidate]  # type: ignore[index]
+    data, renderer, trainer = parts(*TINY, "~trainer.callbacks", "experiment=auto", *overrides)
+    assert trainer.fit(renderer, data.frames("train")).step == 2
+
+
 GROUPS = ("background", "deformation", "experiment", "field", "renderer", "sampler", "trainer/pixels")
 CHOICES = [f"{group}={name}" for group in GROUPS for name in names(group) if (group, name) != ("renderer", "base")]
 

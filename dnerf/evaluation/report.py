@@ -47,6 +47,7 @@ def write_report_text(
     films: Sequence[Path] = (),
     sheets: Sequence[tuple[str, str, Path]] = (),
     temporal: Mapping[str, Any] | None = None,
+    plan: Sequence[Sequence[str]] = (),
 ) -> str:
     """The page of a run as HTML text.
 
@@ -58,6 +59,7 @@ def write_report_text(
         config: the run's config as YAML text.
         sheets: heading, caption and PNG file of each image.
         temporal: scores over time as in `temporal.json`, or None.
+        plan: rows of the table of decisions, its header first; none if nothing was decided.
 
     Raises:
         ValueError: if the extra is not installed, there are no scores, a file is of another type, or all are too large
@@ -83,6 +85,7 @@ def write_report_text(
         sheets=[{"title": heading, "caption": caption, "uri": data_uri(path)} for heading, caption, path in sheets],
         curves=[_curve(m) for m in metrics if len(m["frames"]) > 1],
         temporal=None if temporal is None else _temporal(temporal),
+        plan=plan,
         table=_table([{"protocol": "own", **m} for m in metrics]),
         facts=_facts(first),
         frames=_frames(first["frames"]),

@@ -49,12 +49,17 @@ class Plan:
         """Names of the chosen candidates, by part."""
         return {name: decision.choice for name, decision in self.decisions.items()}
 
-    def table(self) -> str:
-        """The decisions, a line each."""
-        rows = [("part", "choice", "by", "gain (dB)", "seconds", "why")]
+    def rows(self) -> list[tuple[str, ...]]:
+        """The decisions as a table of texts, its header first."""
+        rows: list[tuple[str, ...]] = [("part", "choice", "by", "gain (dB)", "seconds", "why")]
         for name, d in self.decisions.items():
             gain = "" if d.gain is None else f"{d.gain:+.2f} ± {d.error or 0:.2f}"
             rows.append((name, d.choice, d.by, gain, f"{d.seconds:.1f}", d.why))
+        return rows
+
+    def table(self) -> str:
+        """The decisions, a line each."""
+        rows = self.rows()
         widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
         padded = ([*(cell.ljust(w) for cell, w in zip(row, widths)), row[-1]] for row in rows)
         return "\n".join("  ".join(cells).rstrip() for cells in padded)

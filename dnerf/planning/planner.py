@@ -10,6 +10,7 @@ from dnerf.planning.evidence import Finding
 from dnerf.planning.parts import Part
 from dnerf.planning.plan import Decision, Plan, fingerprint
 from dnerf.planning.trials import Contender, Effort, HeldOut, Maker, contest, split_frames
+from dnerf.training.callbacks import Callback
 from dnerf.training.run import Run
 
 logger = logging.getLogger(__name__)
@@ -26,11 +27,12 @@ def make_plan(
     *,
     seed: int = 0,
     share: float = 0.1,
+    callbacks: Mapping[str, Callback] | None = None,
 ) -> tuple[Plan, Run | None]:
     """Decide every part, and the run that the trials' winner has begun.
 
     Parts are decided one after the other, in the order of when they are tried. Candidates go on from the weights of the
-    model decided so far, train for the same time (or steps, if that is what ends training), and are compared on held-out
+    model decided so far, train for the same time (or steps, if those end training), and are compared on held-out
     frames; the loser's time counts as training time. All of it takes at most a share of the budget.
 
     Args:
@@ -40,19 +42,22 @@ def make_plan(
         frames: the training split.
         seed: of the trials' draws.
         share: of the training's seconds, or steps, for trials.
+        callbacks: around the steps of the model that stands, until it is the final one; none if None.
 
     Returns:
         plan: decisions for all parts.
         run: of the model that `make` builds for them, some steps in; None if no trial was needed.
     """
-    return _Planner(parts, given, make, frames, seed, share).decide()
+    return _Planner(parts, given, make, frames, seed, share, callbacks or {}).decide()
 
 
 class _Planner:
     def __init__(
-        self, parts: Mapping[str, Part], given: Mapping[str, str], make: Maker, frames: Frames, seed: int, share: float
-    ) -> None:
+        self, parts: Mapping[str, Part], given: Mapping[str, str], make: Maker, frames: Frames, seed: int,
+        share: float, callbacks: Mapping[str, Callback],
+    ) -> None:  # fmt: skip
         self.parts, self.make, self.frames, self.seed, self.share = parts, make, frames, seed, share
+        self.callbacks = callbacks
         self.decisions: dict[str, Decision] = {}
         self.standing = {name: Finding(part.default, "") for name, part in parts.items()}
         self.leading: Contender | None = None
@@ -91,6 +96,10 @@ class _Planner:
                 self.decisions[name] = self._untried(name, f"{len(self.frames)} frames are too few to try")
             else:
                 self._try(name, *halves, num_left=len(self.tried) - number)
+        if self.leading is not None:
+            for callback in self.callbacks.values():
+                callback.on_train_end(self.leading.run)
+            self.leading.run.callbacks = {}
         plan = Plan({name: self.decisions[name] for name in self.parts}, fingerprint(self.frames))
         return plan, None if self.leading is None else self.leading.run
 
@@ -117,6 +126,7 @@ class _Planner:
         finite = {"gain": better, "error": error} if math.isfinite(better) else {}
         self.decisions[name] = Decision(winner.choice, "trial", why, seconds=lost, **finite)
         winner.run.seconds += lost
+        winner.run.callbacks = leading.run.callbacks
         self.leading = winner
 
     def _untried(self, name: str, why: str) -> Decision:
@@ -128,6 +138,9 @@ class _Planner:
         """The model decided so far, trained until a progress."""
         if self.leading is None:
             self.leading = Contender.fresh("", self.make, choices, learnt, self.seed)
+            self.leading.run.callbacks = self.callbacks
+            for callback in self.callbacks.values():
+                callback.on_train_begin(self.leading.run)
         run, limits = self.leading.run, self.leading.trainer.limits
         self.leading.trainer.advance(run, lambda: limits.progress(run.step, run.seconds) >= at)
         return self.leading

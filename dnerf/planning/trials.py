@@ -42,6 +42,7 @@ class Contender:
     def __init__(self, choice: str, trainer: Trainer, run: Run) -> None:
         self.choice, self.trainer, self.run = choice, trainer, run
         self.errors = torch.empty(0)  # (F,) mean squared, of each held-out frame
+        self.has_failed = False
 
     @classmethod
     def fresh(cls, choice: str, make: Maker, choices: Mapping[str, str], frames: Frames, seed: int) -> "Contender":
@@ -56,7 +57,7 @@ class Contender:
         return other
 
     def advance(self, effort: "Effort") -> None:
-        """Take steps until the effort is spent, or training ends."""
+        """Take steps until the effort is spent, or training ends, or fails, which is noted."""
         run, limits = self.run, self.trainer.limits
         step, seconds = run.step + effort.num_steps, run.seconds + effort.seconds
 
@@ -64,7 +65,15 @@ class Contender:
             enough = run.step >= step if limits.max_seconds is None else run.seconds >= seconds
             return enough or limits.is_finished(run.step, run.seconds)
 
-        self.trainer.advance(run, is_done)
+        try:
+            self.trainer.advance(run, is_done)
+        except FloatingPointError:
+            self.has_failed = True
+
+    def compare(self, held: "HeldOut") -> None:
+        """Note the errors on held-out frames: infinite ones of a candidate that failed."""
+        errors = held.errors(self.run.renderer)
+        self.errors = torch.full_like(errors, math.inf) if self.has_failed else errors
 
 
 @dataclass(frozen=True)
@@ -155,7 +164,7 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> R
         for contender in left:
             inside = inside.within(_times_in(contender))
         for contender in left:
-            contender.errors = inside.errors(contender.run.renderer)
+            contender.compare(inside)
         seconds += time.perf_counter() - begin
         if len(left) > 2:
             left = sorted(left, key=lambda c: float(c.errors.mean()))[: (len(left) + 1) // 2]

@@ -2,22 +2,15 @@
 
 import json
 import sys
-from functools import cache
-from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from benchmarks import runs
-from benchmarks.needs import Trial, last_of_each, removing, smallest_enough
+from benchmarks.needs import run as run_needs_suite
 from benchmarks.runs import run_training
 from benchmarks.scenes import scene_overrides
 from benchmarks.suite import Settings
 from benchmarks.training import run as run_training_suite
-from dnerf.training.runs import build
-
-BOX = "[[-1.5,-1.5,-1.5],[1.5,1.5,1.5]]"
 
 SCRIPT = """
 import json, sys
@@ -30,9 +23,13 @@ ballast[::4096] = b"x" * len(ballast[::4096])
 out = Path(values["out_dir"])
 out.mkdir(parents=True)
 seconds = float(values.get("trainer.max_seconds", 1))
-metrics = {"psnr": 20 + seconds + int(values.get("seed", 0)), "ssim": 0.5, "train_seconds": seconds, "num_steps": 10,
+choices = {"first": values.get("plan.first", "a"), "second": values.get("plan.second", "c")}
+psnr = 20 + 2 * (choices["first"] == "b") + seconds + int(values.get("seed", 0))
+metrics = {"psnr": psnr, "ssim": 0.5, "train_seconds": seconds, "num_steps": 10,
            "num_parameters": 7, "seconds_per_frame": 0.25, "split": "test", "frames": []}
 (out / "metrics.json").write_text(json.dumps(metrics))
+plan = {"data": "", "parts": {k: {"choice": v, "by": "trial", "seconds": 1.5} for k, v in choices.items()}}
+(out / "plan.yaml").write_text(json.dumps(plan))
 (out / "model.safetensors").write_bytes(bytes(1 << 18))
 with open(out.parent / "calls.txt", "a") as file:
     file.write(" ".join(sys.argv[1:]) + chr(10))
@@ -96,89 +93,20 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     assert "flow" not in result.summary
 
 
-def trial(psnr):
-    return Trial(psnr, 0, 0, 0, 0, 0)
-
-
-@pytest.mark.parametrize(("together", "removed"), [(29.95, ["b", "a"]), (29.0, ["a"])])
-def test_parts_that_are_missed_together_are_put_back_the_most_valuable_first(together, removed):
-    without = {"a": trial(30.0), "b": trial(29.95), "c": trial(25.0)}
-    tried = []
-
-    def train(names):
-        tried.append(names)
-        return trial(together)
-
-    names, smallest = smallest_enough(trial(29.92), without, train)
-    assert names == removed
-    assert smallest.psnr >= 29.9
-    assert tried == [["b", "a"]]
-
-
-@pytest.mark.parametrize("missed_by", [0.0, 0.2, 0.5, 2.5, 6.0, 100.0])
-def test_as_few_parts_as_needed_are_put_back_by_few_trainings(missed_by):
-    worth = {name: 0.25 * (8 - number) for number, name in enumerate("abcdefgh")}  # a is worth most
-    without = {name: trial(0.0) for name in worth}  # and nothing is missed alone
-    tried = []
-
-    def train(names):
-        tried.append(names)
-        return trial(missed_by - sum(worth[name] for name in names))
-
-    names, _ = smallest_enough(trial(0.0), without, train)
-    kept = [k for k in range(len(worth)) if missed_by - sum(list(worth.values())[k:]) >= -0.1]
-    assert names == list(worth)[min([*kept, len(worth) - 1]) :]
-    assert len(tried) <= 3  # log2(8)
-
-
-def test_what_hinders_does_not_make_other_parts_needed():
-    """Without b all is much better; a and c are no more missed for that."""
-    without = {"a": trial(20.0), "b": trial(25.0), "c": trial(20.5), "d": trial(18.0)}
-    names, smallest = smallest_enough(trial(20.0), without, lambda names: trial(25.0 + len(names)))
-    assert names == ["a", "c", "b"]
-    assert smallest.psnr == 28
-    worse = smallest_enough(trial(20.0), without, lambda names: trial(24.0))
-    assert worse == (["b"], without["b"])
-
-
-def test_all_parts_stay_if_each_is_missed():
-    full = trial(30.0)
-    assert smallest_enough(full, {"a": trial(20.0)}, lambda names: full) == ([], full)
-
-
-def test_a_part_that_is_gone_with_another_is_not_removed_twice():
-    parts, includes = {"a": ["a=1"], "b": ["a.c=2", "d=3"]}, {"a": ["b"]}
-    assert removing(["b", "a"], parts, includes) == ["a=1"]
-    assert removing(["b"], parts, includes) == ["a.c=2", "d=3"]
-
-
-def test_an_override_that_is_replaced_is_not_printed():
-    assert last_of_each(["a=1", "b=2", "a=null"]) == ["b=2", "a=null"]
-
-
-CONF = Path(__file__).parents[2] / "conf"
-NEEDS = OmegaConf.to_container(OmegaConf.load(CONF / "benchmark.yaml").needs, resolve=True)
-
-
-@cache
-def composed(*overrides):
-    base = [f"experiment={NEEDS['experiment']}", *NEEDS["full"], f"data.box={BOX}"]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", last_of_each([*base, *overrides]))
-
-
-@pytest.mark.parametrize("names", [*([name] for name in NEEDS["parts"]), list(NEEDS["parts"])], ids=" ".join)
-def test_parts_of_the_needs_can_be_removed_alone_and_together(names):
-    config = composed(*removing(names, NEEDS["parts"], NEEDS["includes"]))
-    assert config != composed()
-    plain = OmegaConf.to_container(config, resolve=True)
-    renderer = build(plain["renderer"])
-    for loss in build(plain["trainer"]["losses"]).values():
-        loss.check(renderer)
-
-
-def test_parts_that_are_gone_with_others_are_parts():
-    assert {name for names in NEEDS["includes"].values() for name in names} <= set(NEEDS["parts"])
+def test_needs_suite_says_which_decisions_were_right_wrong_or_open(command, tmp_path):
+    """The stand-in scores 2 dB more with `b`, though it chose `a`; `d` makes no difference."""
+    parts = {"first": {"candidates": {"a": [], "b": []}}, "second": {"candidates": {"c": [], "d": []}}}
+    options = {
+        "scenes": ["walker"], "seconds": 4, "seeds": [0, 2], "resolution": 50, "frames": None, "overrides": [],
+        "splits": {}, "data_root": None, "parts": parts,
+    }  # fmt: skip
+    result = run_needs_suite(Settings(work_dir=tmp_path / "work", train_command=command, options=options))
+    rows = {row["part"]: row for row in result.tables[0].rows}
+    assert (rows["first"]["choice"], rows["first"]["other"], rows["first"]["verdict"]) == ("a", "b", "wrong")
+    assert rows["first"]["worth_dB"] == pytest.approx(-2)
+    assert (rows["second"]["worth_dB"], rows["second"]["verdict"], rows["second"]["seeds"]) == (0, "open", 2)
+    assert rows["second"]["by"] == "trial"
+    assert any("2.00 dB more" in finding for finding in result.findings)
 
 
 def test_scenes_are_exact_ones_or_folders(tmp_path):
