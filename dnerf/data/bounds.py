@@ -7,8 +7,9 @@ from torch.nn.functional import max_pool3d
 from dnerf.core.checks import check_shape
 from dnerf.core.geometry import ray_box
 from dnerf.data.background_check import border_color
-from dnerf.data.carving import EVERY_PIXEL, Silhouettes, carve, hold_opaque
+from dnerf.data.carving import EVERY_PIXEL, Silhouettes, carve, hold_opaque, opaque_rays
 from dnerf.data.frames import Frames
+from dnerf.data.normalization import IDENTITY, Similarity
 from dnerf.samplers import OccupiedCells
 
 ROOM = 0.03  # at each face, of the longest side: surfaces are softer in training than they are
@@ -111,11 +112,11 @@ def _evenly(count: int, most: int) -> list[int]:
     return torch.linspace(0, count - 1, min(count, most)).round().long().tolist()
 
 
-def check_views(frames: Frames, box: Tensor) -> None:
+def check_views(frames: Frames, box: Tensor, similarity: Similarity = IDENTITY) -> None:
     """Raise unless some pixel's ray is in the box (2, 3) between the planes: otherwise there is nothing to learn from.
 
     One of `EVERY_PIXEL` squared pixels of each view is looked at. The ValueError names the box, the planes and where
-    the cameras' rays are between them.
+    the cameras' rays are between them, in the data set's own units.
     """
     box = box.to(frames.poses.device)
     width, height = frames.intrinsics.width, frames.intrinsics.height
@@ -126,11 +127,26 @@ def check_views(frames: Frames, box: Tensor) -> None:
         enter, leave = ray_box(rays.origins, rays.directions, box)
         if bool((enter.maximum(rays.near) < leave.minimum(rays.far)).any()):
             return
+    near, far = frames.near / similarity.scale, frames.far / similarity.scale
+    own, seen = (similarity.box_from_world(corners).float().tolist() for corners in (box, seen_box(frames, 0)))
     raise ValueError(
-        f"box must be seen by some camera between near {frames.near:g} and far {frames.far:g}, got {box.tolist()}; "
-        f"what cameras see there lies within {seen_box(frames, 0).tolist()}: other units, or another data.box, "
-        "data.near or data.far, are meant"
+        f"box must be seen by some camera between near {near:g} and far {far:g}, got {own}; what cameras see there lies "
+        f"within {seen}: other units, or another data.box, data.near or data.far, are meant"
     )
+
+
+def opaque_without_room(frames: Frames, box: Tensor) -> float:
+    """The share of opaque pixels whose rays miss the box (2, 3) between the planes, so that nothing explains them.
+
+    One of `EVERY_PIXEL` squared pixels of each view is looked at.
+    """
+    count = missed = 0
+    for index in range(len(frames)):
+        rays = opaque_rays(frames, index)
+        enter, leave = ray_box(rays.origins, rays.directions, box.to(rays.origins))
+        missed += int((enter.maximum(rays.near) >= leave.minimum(rays.far)).sum())
+        count += len(rays)
+    return missed / max(count, 1)
 
 
 def cut_faces(cells: OccupiedCells, frames: Frames, min_views: float = MIN_VIEWS) -> list[str]:

@@ -146,8 +146,7 @@ def hold_opaque(frames: Frames, box: Tensor) -> Tensor:
     """
     steps = torch.linspace(0, 1, NUM_DISTANCES, device=box.device)
     for index in range(len(frames)):
-        rows, columns = (frames.images[index, ::EVERY_PIXEL, ::EVERY_PIXEL, 3] >= OPAQUE).nonzero().unbind(-1)
-        rays = frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * frames.intrinsics.width + columns))
+        rays = opaque_rays(frames, index)
         enter, leave = ray_box(rays.origins, rays.directions, box)
         past = rays[((enter > leave) | (leave < rays.near) | (enter > rays.far)).nonzero()[:, 0]]
         distances = past.near[:, None] + (past.far - past.near)[:, None] * steps
@@ -156,6 +155,12 @@ def hold_opaque(frames: Frames, box: Tensor) -> Tensor:
         nearest = positions[torch.arange(len(past), device=box.device), outside.argmin(-1)]
         box = torch.stack([torch.cat([box[:1], nearest]).amin(0), torch.cat([box[1:], nearest]).amax(0)])
     return box
+
+
+def opaque_rays(frames: Frames, index: int) -> Rays:
+    """The rays of one in `EVERY_PIXEL` squared opaque pixels of a frame."""
+    rows, columns = (frames.images[index, ::EVERY_PIXEL, ::EVERY_PIXEL, 3] >= OPAQUE).nonzero().unbind(-1)
+    return frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * frames.intrinsics.width + columns))
 
 
 def _dilated(blocks: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Films of a model: camera and time paths, frames that survive a kill, images of depth and motion, and their files."""
 
-from dnerf.visualization.camera_paths import box_planes, fixed_path, orbit_path, pose_around, spiral_path
+from dnerf.core.geometry import box_planes
+from dnerf.visualization.camera_paths import fixed_path, orbit_path, pose_around, spiral_path
 from dnerf.visualization.colours import colorize, error_map, flow_colors, flow_image, scaled_image
 from dnerf.visualization.films import FILM_FORMATS, Share, is_empty, render_frames_to, write_films, write_plan
 from dnerf.visualization.frame_outputs import OUTPUTS, check_outputs, deformation_magnitude, render_layers
