@@ -152,8 +152,9 @@ def _write_temporal(
 def _first_camera(data: DataSource, width: int, device: torch.device) -> Camera:
     """The first camera of the test split, or of the train split if there is none, with so many pixels."""
     frames = data.frames(camera_split(None, data))
-    height = round(width * frames.intrinsics.height / frames.intrinsics.width)
-    return Camera(frames.intrinsics.resized(width, height), frames.poses[0].to(device), frames.near, frames.far)
+    intrinsics = frames.intrinsics[0]
+    height = round(width * intrinsics.height / intrinsics.width)
+    return Camera(intrinsics.resized(width, height), frames.poses[0].to(device), frames.near, frames.far)
 
 
 def _write_consistency(folder: Path, renderer: Renderer, data: DataSource, settings: dict[str, Any]) -> None:

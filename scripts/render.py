@@ -136,7 +136,7 @@ def _fingerprint(run: str) -> str:
 
 
 def _views(config: DictConfig, frames: Frames, box: Tensor | None, device: torch.device) -> list[View]:
-    intrinsics = _resized(frames.intrinsics, config.resolution)
+    intrinsics = _resized(frames.intrinsics[0], config.resolution)
     angles: list[float | None] | None = None
     own_times: list[float] | None = None
     if config.path.name == "keyframes":

@@ -63,7 +63,7 @@ def evaluate_run(
         **evaluation.as_dict(),
         **training,
         "frames_of_split": len(frames),
-        "resolution": frames.intrinsics.width,
+        "resolution": frames.intrinsics[0].width,
         "background": _color_name(renderer),
         **(settings or {}),
         **provenance(),

@@ -78,7 +78,7 @@ def _camera(config: DictConfig, data: DataSource, device: torch.device) -> Camer
     frames = data.frames(camera_split(config.split, data))
     if not 0 <= config.frame < len(frames):
         raise ValueError(f"frame must be in 0..{len(frames) - 1}, got {config.frame}")
-    intrinsics = frames.intrinsics
+    intrinsics = frames.intrinsics[config.frame]
     if config.resolution is not None:
         height = round(config.resolution * intrinsics.height / intrinsics.width)
         intrinsics = intrinsics.resized(config.resolution, height)

@@ -45,7 +45,8 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     trainer = build(config.trainer, trusted=True)
     folder = processes.from_first(lambda: held.enter_context(opened(config)))
     if processes.is_first:
-        size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
+        sizes = {f"{each.width} x {each.height}" for each in frames.intrinsics}
+        size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
         num_parameters = sum(p.numel() for p in renderer.parameters())
         print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {renderer.device}")
         print(f"box: {config.data.get('box')}, {'fitted to the frames' if fitted else 'as given'}")

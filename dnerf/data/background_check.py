@@ -34,8 +34,11 @@ def background_contradiction(color: Tensor, frames: Frames) -> str | None:
 def border_color(frames: Frames) -> Tensor | None:
     """The colour (3,) in [0, 1] that most pixels at the borders of opaque images have; None if there is none."""
     chosen = torch.linspace(0, len(frames) - 1, min(len(frames), MAX_FRAMES)).round().long()
-    images = frames.images[chosen.to(frames.images.device)][..., :3].cpu()
-    border = torch.cat([images[:, [0, -1]].flatten(0, 2), images[:, :, [0, -1]].flatten(0, 2)]).float()
+    parts = []
+    for index in chosen.tolist():
+        image = frames.stored_image(index)[..., :3]
+        parts += [image[[0, -1]].flatten(0, 1).cpu(), image[:, [0, -1]].flatten(0, 1).cpu()]
+    border = torch.cat(parts).float()
     color = border.median(0).values
     share = ((border - color).abs().amax(-1) <= SAME_LEVELS).float().mean()
     return color / 255 if share > 0.5 else None

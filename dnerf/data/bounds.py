@@ -78,13 +78,12 @@ def seen_box(frames: Frames, share: float) -> Tensor:
 
     The share is of the cameras that see the place which most of them see; 0 for what any sees.
     """
-    width, height = frames.intrinsics.width, frames.intrinsics.height
-    rows, columns = (torch.linspace(0, size - 1, 4, device=frames.poses.device).round() for size in (height, width))
-    pixels = (width * rows[:, None] + columns).reshape(-1).long()
+    steps = torch.linspace(0, 1, 32, device=frames.poses.device)
     positions = []
     for index in _evenly(len(frames), MAX_VIEWS):
-        rays = frames.camera(index).rays(0.0, pixels)
-        steps = torch.linspace(0, 1, 32, device=pixels.device)
+        height, width = frames.layout.sizes[index]
+        rows, columns = (torch.linspace(0, size - 1, 4, device=steps.device).round() for size in (height, width))
+        rays = frames.camera(index).rays(0.0, (width * rows[:, None] + columns).reshape(-1).long())
         begin = rays.near.maximum(1e-3 * rays.far)[:, None]  # a logarithm needs one
         distances = begin * (rays.far[:, None] / begin) ** steps
         positions.append((rays.origins[:, None] + distances[..., None] * rays.directions[:, None]).flatten(0, 1))
@@ -97,10 +96,10 @@ def seen_box(frames: Frames, share: float) -> Tensor:
 
 def share_of_views(frames: Frames, positions: Tensor) -> Tensor:
     """The share (N,) of views between whose planes, and within whose image, positions (N, 3) in world units lie."""
-    width, height = frames.intrinsics.width, frames.intrinsics.height
     chosen = _evenly(len(frames), LOOKED_AT)
     seen = torch.zeros(len(positions), device=positions.device)
     for index in chosen:
+        height, width = frames.layout.sizes[index]
         pixels, depth = frames.camera(index).project(positions)
         x, y = pixels.unbind(-1)
         is_between = (frames.near <= depth) & (depth <= frames.far)
@@ -119,11 +118,9 @@ def check_views(frames: Frames, box: Tensor, similarity: Similarity = IDENTITY) 
     the cameras' rays are between them, in the data set's own units.
     """
     box = box.to(frames.poses.device)
-    width, height = frames.intrinsics.width, frames.intrinsics.height
-    rows, columns = (torch.arange(0, size, EVERY_PIXEL, device=box.device) for size in (height, width))
-    pixels = (width * rows[:, None] + columns).reshape(-1)
-    for index in range(len(frames)):
-        rays = frames.camera(index).rays(0.0, pixels)
+    for index, (height, width) in enumerate(frames.layout.sizes):
+        rows, columns = (torch.arange(0, size, EVERY_PIXEL, device=box.device) for size in (height, width))
+        rays = frames.camera(index).rays(0.0, (width * rows[:, None] + columns).reshape(-1))
         enter, leave = ray_box(rays.origins, rays.directions, box)
         if bool((enter.maximum(rays.near) < leave.minimum(rays.far)).any()):
             return

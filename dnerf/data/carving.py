@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from dnerf.core.cameras import Intrinsics, camera_rays
+from dnerf.core.cameras import camera_rays
+from dnerf.core.frame_intrinsics import FrameIntrinsics
 from dnerf.core.geometry import ray_box
 from dnerf.core.rays import Rays
 from dnerf.data.frames import Frames
@@ -35,31 +36,39 @@ EVERY_PIXEL = 3  # in rows and columns, of those that are looked at one by one
 class Silhouettes:
     """Opaque blocks of pixels of all views in order of time."""
 
-    intrinsics: Intrinsics  # of all views
+    intrinsics: FrameIntrinsics
     planes: tuple[float, float]  # z-depths where rays begin and end
     poses: Tensor  # (F, 4, 4) camera-to-world
     times: Tensor  # (F,) times as whole numbers: how many different ones come before
     block: int  # pixels along a block's sides
     # (F, H, W) uint8, how many blocks away the nearest opaque one is, by rows or columns, whichever is more; 255 beyond
-    # `MAX_DISTANCE`.
+    # `MAX_DISTANCE`. Smaller views lie in the upper left corner.
     distances: Tensor
 
     @classmethod
     def of(cls, frames: Frames) -> "Silhouettes":
         """The silhouettes of frames with alpha."""
-        block = -(-max(frames.images.shape[1:3]) // NUM_BLOCKS)
+        block = -(-max(max(size) for size in frames.layout.sizes) // NUM_BLOCKS)
         order = frames.times.argsort(stable=True)
-        blocks = [max_pool2d(frames.images[i, None, ..., 3].float(), block, ceil_mode=True) for i in order.tolist()]
+        rows = order.tolist()
+        blocks = [max_pool2d(frames.stored_image(i)[None, ..., 3].float(), block, ceil_mode=True) for i in rows]
+        sizes = [each.shape[1:] for each in blocks]
+        height, width = (max(size[axis] for size in sizes) for axis in (0, 1))
+        blocks = [pad(each, (0, width - each.shape[2], 0, height - each.shape[1])) for each in blocks]
         opaque = torch.cat(blocks) >= OPAQUE
         distances = torch.where(opaque, 0, 255).to(torch.uint8)
         for distance in range(1, MAX_DISTANCE + 1):
             opaque = _dilated(opaque)
             distances.masked_fill_(opaque & (distances == 255), distance)
+        for view, (rows_in, columns_in) in zip(distances, sizes):
+            view[rows_in:], view[:, columns_in:] = 255, 255
         times = frames.times[order].unique(return_inverse=True)[1]
-        return cls(frames.intrinsics, (frames.near, frames.far), frames.poses[order], times, block, distances)
+        intrinsics = FrameIntrinsics([frames.intrinsics[i] for i in rows], order.device)
+        return cls(intrinsics, (frames.near, frames.far), frames.poses[order], times, block, distances)
 
     def outlines(self) -> tuple[Tensor, Rays]:
         """Views (R,) and rays of opaque blocks beside clear ones or at the border: what is opaque ends on such rays."""
+        # The border is clear, and so is what lies beyond a smaller view.
         clear = _dilated(pad(self.distances > 0, (1, 1, 1, 1), value=True))[:, 1:-1, 1:-1]
         views, rows, columns = ((self.distances == 0) & clear).nonzero().unbind(-1)
         kept = slice(None, None, max(1, -(-len(views) // MAX_RAYS)))
@@ -67,7 +76,8 @@ class Silhouettes:
         near, far = self.planes
         columns, rows = ((index + 0.5) * self.block - 0.5 for index in (columns, rows))
         times = torch.zeros(len(views), device=views.device)
-        return views, camera_rays(self.intrinsics, self.poses[views], columns, rows, times=times, near=near, far=far)
+        lenses = self.intrinsics.of(views)
+        return views, camera_rays(lenses, self.poses[views], columns, rows, times=times, near=near, far=far)
 
     def support(self, views: Tensor, rays: Rays, distances: Tensor, motion: float) -> Tensor:
         """How many consecutive views have positions on rays in opaque pixels, the rays' own among them: (R, D) int64.
@@ -101,9 +111,8 @@ class Silhouettes:
         start = (rotation * (rays.origins - position)[:, :, None]).sum(1)
         along = (rotation * rays.directions[:, :, None]).sum(1)
         x, y, z = (start[index] + distances[:, None] * along[index]).unbind(-1)
-        focal_x, focal_y, column, row = self.intrinsics.lens
-        columns = ((column - x / z * focal_x + 0.5) / self.block).floor()
-        rows = ((row + y / z * focal_y + 0.5) / self.block).floor()
+        lenses = self.intrinsics.shared or self.intrinsics.of(others[index])
+        columns, rows = (((place + 0.5) / self.block).floor() for place in lenses.seen_at(x / -z, y / -z))
         height, width = self.distances.shape[1:]
         near, far = self.planes
         is_seen = (-z >= near) & (-z <= far) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
@@ -135,7 +144,8 @@ def carve(silhouettes: Silhouettes, box: Tensor) -> Tensor | None:
     chosen = distances[index, step]
     positions = rays.origins[index] + chosen[:, None] * rays.directions[index]
     spacing = (leave / enter).log()[index] / NUM_DISTANCES
-    room = 0.5 * chosen * spacing.clamp(min=silhouettes.block / silhouettes.intrinsics.focal_x)
+    blocks = torch.tensor([silhouettes.block / lens.focal_x for lens in silhouettes.intrinsics.each], device=box.device)
+    room = 0.5 * chosen * spacing.maximum(blocks[views[index]])
     return torch.stack([(positions - room[:, None]).amin(0), (positions + room[:, None]).amax(0)])
 
 
@@ -159,8 +169,9 @@ def hold_opaque(frames: Frames, box: Tensor) -> Tensor:
 
 def opaque_rays(frames: Frames, index: int) -> Rays:
     """The rays of one in `EVERY_PIXEL` squared opaque pixels of a frame."""
-    rows, columns = (frames.images[index, ::EVERY_PIXEL, ::EVERY_PIXEL, 3] >= OPAQUE).nonzero().unbind(-1)
-    return frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * frames.intrinsics.width + columns))
+    image = frames.stored_image(index)
+    rows, columns = (image[::EVERY_PIXEL, ::EVERY_PIXEL, 3] >= OPAQUE).nonzero().unbind(-1)
+    return frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * image.shape[1] + columns))
 
 
 def _dilated(blocks: Tensor) -> Tensor:

@@ -183,9 +183,7 @@ def _facts(views: Sequence[View], fps: float) -> dict[str, NDArray]:
         facts["poses"] = np.stack([view.camera.pose.cpu().numpy() for view in views])
         lenses, rows = [view.camera.intrinsics for view in views], []
         for lens in lenses:
-            center_x = 0.5 * lens.width if lens.center_x is None else lens.center_x
-            center_y = 0.5 * lens.height if lens.center_y is None else lens.center_y
-            rows.append([lens.width, lens.height, lens.focal_x, lens.focal_y, center_x, center_y])
+            rows.append([lens.width, lens.height, lens.focal_x, lens.focal_y, *lens.center])
         facts["intrinsics"] = np.array(rows)
         facts["pixel_origin"] = np.array([lens.pixel_origin for lens in lenses])
     return facts

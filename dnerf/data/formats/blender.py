@@ -121,7 +121,10 @@ def save_blender(frames_by_split: Mapping[str, Frames], root: str | Path) -> Non
         raise ValueError("frames_by_split must hold at least one split, got none")
     for split, frames in frames_by_split.items():
         _check_split(split)
-        for index, image in enumerate(frames.images if frames.has_alpha else ()):
+        if frames.shared_intrinsics is None or frames.shared_intrinsics.distortion is not None:
+            raise ValueError(f"frames_by_split[{split!r}] must share one pinhole, got other intrinsics")
+        for index in range(len(frames) if frames.has_alpha else 0):
+            image = frames.stored_image(index)
             # One level above is what rounding of equal floats can leave; it is clamped.
             if bool((image[..., :3].short() > image[..., 3:].short() + 1).any()):
                 raise ValueError(
@@ -145,12 +148,12 @@ def _write_split(frames: Frames, split: str, folder: Path) -> None:
     names = [f"./{split}/r_{index:03d}" for index in range(len(frames))]
 
     def write(index: int) -> None:
-        pixels = frames.images[index].cpu().numpy()
+        pixels = frames.stored_image(index).cpu().numpy()
         image = Image.fromarray(straight_alpha(pixels) if frames.has_alpha else pixels)
         image.save(folder / f"{names[index]}.png")
 
     _in_threads(write, len(frames), MAX_THREADS)
-    camera = frames.intrinsics
+    camera = frames.intrinsics[0]
     fields: dict[str, Any] = {
         "camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.focal_x), "fl_x": camera.focal_x,
         "fl_y": camera.focal_y, "cx": camera.center_x, "cy": camera.center_y, "w": camera.width, "h": camera.height,
