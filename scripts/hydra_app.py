@@ -23,6 +23,7 @@ from settings import check_settings
 
 import dnerf
 from dnerf.core.process import prepare_process
+from dnerf.data import SceneRecord
 from dnerf.rendering.renderer import Renderer
 from dnerf.training import runs
 from dnerf.training.distributed import LostProcess, is_launched
@@ -196,6 +197,11 @@ def load_config(run: str) -> DictConfig:
     config = OmegaConf.create(runs.load_config(run))
     assert isinstance(config, DictConfig)
     return config
+
+
+def load_scene(run: str) -> SceneRecord:
+    """The cameras, times and world of a run's data set; ValueError as `SceneRecord.read`."""
+    return SceneRecord.read(run)
 
 
 def load_renderer(run: str, config: DictConfig, device: torch.device) -> Renderer:

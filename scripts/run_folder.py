@@ -14,6 +14,7 @@ from hydra_app import load_config, moved
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dnerf.core.files import TEMPORARY, claimed, remove_leftovers, write_json, write_text
+from dnerf.data.scene_record import SCENE
 from dnerf.training.checkpoint_folder import CHECKPOINTS, CheckpointFolder
 
 # What may be another when a run is continued: how long, where and how it is watched, not what is trained.
@@ -34,7 +35,7 @@ CHANGEABLE = (
     "trainer.callbacks.box_warning",
 )
 OWN_FOLDERS = (CHECKPOINTS, "previews")
-FITTED = "auto"  # data.box
+FROM_DATA = "background_from_data"
 
 
 def continued(config: DictConfig) -> DictConfig:
@@ -60,8 +61,10 @@ def continued(config: DictConfig) -> DictConfig:
         return config
     moved(saved, config.data_root)
     values = config.copy()
-    if values.data.get("box") == FITTED:  # the run knows which box that is
-        values.data.box = saved.data.get("box", FITTED)
+    # What the run has found in its data: it knows.
+    for name in ("box", *(("background",) if values.get(FROM_DATA) and saved.get(FROM_DATA) else ())):
+        if name in saved:
+            values[name] = saved[name]
     values = resolved(values)
     if given & set(hydra.runtime.choices):  # an experiment or another group was named: all of it must agree
         moved(values, config.data_root)
@@ -162,4 +165,4 @@ def _is_free(folder: Path) -> bool:
     paths = [path for path in folder.iterdir() if not path.name.startswith(TEMPORARY)]
     left = {path.name for path in paths if not path.is_dir() or any(path.iterdir())}
     # A lone config.yaml may be anybody's.
-    return not left or left == {"config.yaml", "overrides.json"}
+    return not left or left - {SCENE} == {"config.yaml", "overrides.json"}

@@ -10,25 +10,49 @@ MAX_FRAMES = 32  # whose borders are looked at, evenly spread
 SAME_LEVELS = 8  # of 255: what JPEG and shading leave of one colour
 
 
-def background_contradiction(color: Tensor, frames: Frames) -> str | None:
-    """What the training images say against a background color (3,) in [0, 1], as a sentence for a warning, or None.
+def data_background(frames: Frames) -> tuple[list[float] | None, str]:
+    """The colour behind training frames that a model should have, and why; None if they go with any.
 
-    Images that are transparent somewhere go with any background. Of opaque ones the file may state it; if it does not,
-    most pixels at their borders may have one colour.
+    Images that are transparent somewhere do. Of opaque ones the file may state it, or most pixels at their borders have
+    one colour; where they show something everywhere, it hardly matters.
     """
     if frames.is_transparent:
-        return None
-    other: Tensor | None
+        return None, "random in training, since the images have alpha"
     if frames.background is not None:
-        says, other = "the data set states", torch.tensor(parse_color(frames.background))
-    else:
-        says, other = "most pixels at the images' borders are", border_color(frames)
-    if other is None or float((color.detach().float().cpu() - other).abs().max()) <= SAME_LEVELS / 255:
+        color = list(parse_color(frames.background))
+        return color, f"{_rounded(torch.tensor(color))}, as the data set states"
+    border = border_color(frames)
+    if border is not None:
+        return border.tolist(), f"{_rounded(border)}, which most pixels at the images' borders are"
+    return [0.0, 0.0, 0.0], "black: the images are opaque and show something everywhere"
+
+
+def background_contradiction(color: Tensor | None, frames: Frames) -> str | None:
+    """What opaque training images say against a background color (3,) in [0, 1], as a sentence for a warning, or None.
+
+    Raises:
+        ValueError: if the data set states another colour.
+    """
+    if color is None or frames.is_transparent:
+        return None
+    if frames.background is not None and _differ(color, torch.tensor(parse_color(frames.background))):
+        stated = _rounded(torch.tensor(parse_color(frames.background)))
+        raise ValueError(
+            f"background must be {stated} as the data set states, got {_rounded(color)}: the model would explain the "
+            "difference by density in empty space; leave background=auto, or set background=white "
+            f"background.color={str(stated).replace(' ', '')}"
+        )
+    border = border_color(frames)
+    if border is None or not _differ(color, border):
         return None
     return (
-        f"background is {_rounded(color)}, but {says} {_rounded(other)}: the model would explain the difference by "
-        "density in empty space; set background.color"
+        f"background is {_rounded(color)}, but most pixels at the images' borders are {_rounded(border)}: the model "
+        "would explain the difference by density in empty space; leave background=auto, or set background.color"
     )
+
+
+def _differ(color: Tensor, other: Tensor) -> bool:
+    return float((color.detach().float().cpu() - other).abs().max()) > SAME_LEVELS / 255
 
 
 def border_color(frames: Frames) -> Tensor | None:

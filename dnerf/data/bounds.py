@@ -127,8 +127,8 @@ def check_views(frames: Frames, box: Tensor, similarity: Similarity = IDENTITY) 
     near, far = frames.near / similarity.scale, frames.far / similarity.scale
     own, seen = (similarity.box_from_world(corners).float().tolist() for corners in (box, seen_box(frames, 0)))
     raise ValueError(
-        f"box must be seen by some camera between near {near:g} and far {far:g}, got {own}; what cameras see there lies "
-        f"within {seen}: other units, or another data.box, data.near or data.far, are meant"
+        f"box must be seen by some camera between near {near:g} and far {far:g}, got {own}; what cameras see there "
+        f"lies within {seen}: other units, or another data.box, data.near or data.far, are meant"
     )
 
 

@@ -17,7 +17,7 @@ from dnerf.data.frames import Frames
 from dnerf.data.loading import LoadedFrames, final_intrinsics, load_frames
 from dnerf.data.placing import Given, place, planes_between
 from dnerf.data.scene_record import CameraSet, World
-from dnerf.data.source import DataSource, check_train_end, given_box
+from dnerf.data.source import DataSource, NoImages, check_train_end, given_box
 from dnerf.data.splits import TIMES, SplitFrames, split_frames
 
 Z_UP = (0.0, 0.0, 1.0)
@@ -130,18 +130,18 @@ class FolderData(DataSource):
         super().check(split)
         splits = self._split.splits
         if split not in splits:
-            raise ValueError(
-                f"{self.capture.path}: there is no {split} split, only {', '.join(splits)}; data.hold_out=8 makes a test "
-                "split of every eighth training frame, evaluate_split=null scores none"
+            raise NoImages(
+                f"{self.capture.path}: there is no {split} split, only {', '.join(splits)}; data.hold_out=8 makes a "
+                "test split of every eighth training frame, evaluate_split=null scores none"
             )
         if not any(frame.image is not None for frame in splits[split]):
-            raise ValueError(
-                f"{self.capture.path}: the {len(splits[split])} cameras of the {split} split have no images: they can be "
-                "filmed (render.py path=test), not scored; evaluate_split=null scores none"
+            raise NoImages(
+                f"{self.capture.path}: the {len(splits[split])} cameras of the {split} split have no images: they can "
+                "be filmed (render.py path=test), not scored; evaluate_split=null scores none"
             )
 
     def _is_learnt(self, frame: CaptureFrame) -> bool:
-        return frame.image is not None and (self.train_end is None or _times([frame])[0] <= self.train_end)
+        return frame.image is not None and (self.train_end is None or float(_times([frame])[0]) <= self.train_end)
 
     def _load(self, split: str) -> LoadedFrames:
         frames = [frame for frame in self._split.splits[split] if frame.image is not None]

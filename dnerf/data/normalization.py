@@ -118,7 +118,7 @@ class Clock:
     def of(cls, times: Sequence[float]) -> "Clock":
         """The one of a data set's times: [0, 1] is kept, others begin at 0 and end at 1."""
         first, last = min(times), max(times)
-        if 0 <= first and last <= 1:
+        if first >= 0 and last <= 1:
             return cls()
         return cls(first, last - first if last > first else 1.0)
 

@@ -113,8 +113,8 @@ class SceneRecord:
             return record
         except FileNotFoundError:
             raise ValueError(
-                f"{path}: file does not exist; runs keep it from version {VERSION} of this format on, and it is written "
-                "when training begins"
+                f"{path}: file does not exist; training writes it when it begins; runs of earlier versions have "
+                "none and must be trained again"
             ) from None
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             said = " ".join(str(error).split())[:200]

@@ -20,6 +20,10 @@ SPLITS = ("train", "val", "test")
 DIGITS = 4  # of the longest side, to which a fitted box is rounded, outwards
 
 
+class NoImages(ValueError):
+    """A split that a data set does not have, or of which it has cameras alone."""
+
+
 class DataSource(ABC):
     """Frames of a scene by split, in the world that models live in."""
 
@@ -46,7 +50,7 @@ class DataSource(ABC):
         return SceneRecord(self.world(), self.cameras())
 
     def check(self, split: str) -> None:
-        """Raise what `frames` would of a split that is not there, or is broken as far as can be seen in no time."""
+        """Raise what `frames` would of a split, as far as can be seen in no time; `NoImages` if it has none."""
         check_choice("split", split, SPLITS)
 
     def _known(self, frames: Frames, split: str) -> Frames:

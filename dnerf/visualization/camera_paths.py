@@ -10,6 +10,7 @@ from torch import Tensor
 from dnerf.core.cameras import look_at
 from dnerf.core.checks import check_positive, check_shape
 
+
 def pose_around(target: Sequence[float], *, radius: float, azimuth: float, elevation: float) -> Tensor:
     """Pose (4, 4) of a camera at a distance from `target` that looks at it, z up, angles in radians.
 
@@ -37,15 +38,20 @@ def spiral_path(
     target: Sequence[float] = (0.0, 0.0, 0.0),
     turns: float = 2.0,
     start_angle: float = 0.0,
+    sway: float | None = None,
 ) -> Tensor:
-    """Poses (num_poses, 4, 4) circling `target` while rising from one elevation to the other and back."""
+    """Poses (num_poses, 4, 4) circling `target` while rising from one elevation to the other and back.
+
+    With `sway`, an angle, the path does not go round but so far to either side of `start_angle`, `turns` times.
+    """
     check_positive("num_poses", num_poses)
     poses = []
     for i in range(num_poses):
         phase = 2 * math.pi * i / num_poses
         rise = 0.5 * (1 - math.cos(phase))
         elevation = elevations[0] + rise * (elevations[1] - elevations[0])
-        poses.append(pose_around(target, radius=radius, azimuth=start_angle + turns * phase, elevation=elevation))
+        azimuth = start_angle + (turns * phase if sway is None else sway * math.sin(turns * phase))
+        poses.append(pose_around(target, radius=radius, azimuth=azimuth, elevation=elevation))
     return torch.stack(poses)
 
 
