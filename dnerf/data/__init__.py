@@ -1,6 +1,7 @@
 """Data sets: images with cameras and times, and where they come from."""
 
-from dnerf.data.formats.blender import load_blender, save_blender
+from dnerf.data.formats.legacy import load_blender
+from dnerf.data.formats.writers import save_blender
 from dnerf.data.frames import Frames, composite_on
 from dnerf.data.source import SPLITS, BlenderData, DataSource, SyntheticData
 from dnerf.data.synthetic import random_views, render_exact, render_frames

@@ -12,7 +12,7 @@ from torch import Tensor
 from dnerf.core.backgrounds import parse_color
 from dnerf.core.checks import as_box, check_choice, check_positive, check_whole
 from dnerf.data.bounds import fit_box
-from dnerf.data.formats.blender import check_blender, has_transparency, load_blender
+from dnerf.data.formats.legacy import check_blender, has_transparency, load_blender
 from dnerf.data.frames import Frames
 from dnerf.data.synthetic import random_views, render_frames
 from dnerf.scenes import AnalyticScene
