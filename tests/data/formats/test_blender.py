@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dnerf.core.cameras import Intrinsics, look_at
-from dnerf.data.formats.blender import load_blender, save_blender
+from dnerf.data.formats.legacy import load_blender
+from dnerf.data.formats.writers import save_blender
 from dnerf.data.frames import Frames
 from dnerf.data.images import premultiplied_area_average
 
