@@ -35,12 +35,15 @@ def background_contradiction(color: Tensor | None, frames: Frames) -> str | None
     """
     if color is None or frames.is_transparent:
         return None
-    if frames.background is not None and _differ(color, torch.tensor(parse_color(frames.background))):
-        stated = _rounded(torch.tensor(parse_color(frames.background)))
+    if frames.background is not None:
+        stated = torch.tensor(parse_color(frames.background))
+        if not _differ(color, stated):
+            return None
+        shown = _rounded(stated)
         raise ValueError(
-            f"background must be {stated} as the data set states, got {_rounded(color)}: the model would explain the "
+            f"background must be {shown} as the data set states, got {_rounded(color)}: the model would explain the "
             "difference by density in empty space; leave background=auto, or set background=white "
-            f"background.color={str(stated).replace(' ', '')}"
+            f"background.color={str(shown).replace(' ', '')}"
         )
     border = border_color(frames)
     if border is None or not _differ(color, border):
@@ -53,6 +56,11 @@ def background_contradiction(color: Tensor | None, frames: Frames) -> str | None
 
 def _differ(color: Tensor, other: Tensor) -> bool:
     return float((color.detach().float().cpu() - other).abs().max()) > SAME_LEVELS / 255
+
+
+def background_color(frames: Frames) -> Tensor | None:
+    """The colour (3,) in [0, 1] behind opaque images: as the data set states, else as their borders show; else None."""
+    return border_color(frames) if frames.background is None else torch.tensor(parse_color(frames.background))
 
 
 def border_color(frames: Frames) -> Tensor | None:

@@ -6,7 +6,7 @@ from torch.nn.functional import max_pool3d
 
 from dnerf.core.checks import check_shape
 from dnerf.core.geometry import ray_box
-from dnerf.data.background_check import border_color
+from dnerf.data.background_check import background_color
 from dnerf.data.carving import EVERY_PIXEL, Silhouettes, carve, hold_opaque, opaque_rays
 from dnerf.data.frames import Frames
 from dnerf.data.normalization import IDENTITY, Similarity
@@ -33,15 +33,15 @@ def fit_box(frames: Frames, points: Tensor | None = None) -> Tensor:
     - Images with alpha: what their opaque pixels can show (`carve`), with room around it. No opaque pixel looks past
       the box.
     - Otherwise sparse points, if there are any: what holds nearly all of them, with more room.
-    - Otherwise what enough cameras see between their planes: half of them if the images' borders have one colour, so
-      that the scene is in the middle, a tenth of them if the images show something everywhere.
+    - Otherwise, if one colour is behind the scene, the same as with alpha, of the pixels that have another one.
+    - Otherwise what a tenth of the cameras see between their planes: the images show something everywhere.
 
     Args:
         points: (N, 3) on surfaces, for example of structure from motion, in world units; None if there are none.
             ValueError for another shape, or if none is finite.
     """
     if frames.is_transparent:
-        return _with_room(hold_opaque(frames, _carved(frames)), ROOM)
+        return _with_room(hold_opaque(frames, _carved(frames, None)), ROOM)
     if points is not None:
         check_shape("points", points, ("N", 3))
         points = points[points.isfinite().all(-1)]
@@ -49,12 +49,15 @@ def fit_box(frames: Frames, points: Tensor | None = None) -> Tensor:
             raise ValueError("points must hold a finite one, got none")
         ends = torch.tensor([QUANTILE, 1 - QUANTILE], dtype=points.dtype, device=points.device)
         return _with_room(torch.quantile(points, ends, dim=0), ROOM_AROUND_POINTS)
-    return seen_box(frames, SHARES[0] if border_color(frames) is not None else SHARES[1])
+    behind = background_color(frames)
+    if behind is not None:
+        return _with_room(hold_opaque(frames, _carved(frames, behind), behind), ROOM)
+    return seen_box(frames, SHARES[1])
 
 
-def _carved(frames: Frames) -> Tensor:
+def _carved(frames: Frames, behind: Tensor | None) -> Tensor:
     """What opaque pixels can show, within what enough cameras see."""
-    silhouettes = Silhouettes.of(frames)
+    silhouettes = Silhouettes.of(frames, behind)
     for share in SHARES:
         box = seen_box(frames, share)
         while (smaller := carve(silhouettes, box)) is not None:
@@ -133,7 +136,7 @@ def check_views(frames: Frames, box: Tensor, similarity: Similarity = IDENTITY) 
 
 
 def opaque_without_room(frames: Frames, box: Tensor) -> float:
-    """The share of opaque pixels whose rays miss the box (2, 3) between the planes, so that nothing explains them.
+    """The share of opaque pixels of images with alpha whose rays miss the box (2, 3) between the planes, so that nothing explains them.
 
     One of `EVERY_PIXEL` squared pixels of each view is looked at.
     """

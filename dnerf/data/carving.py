@@ -1,4 +1,4 @@
-"""Space carving: what images with alpha can show lies where views near in time are opaque.
+"""Space carving: what images with alpha, or before one colour, can show lies where views near in time are opaque.
 
 The scene moves and most data sets have one view of each time, so views of other times carve, too. On the ray of an
 opaque pixel, each position has its *support*: how many consecutive views, its own among them, have it in an opaque
@@ -19,7 +19,9 @@ from dnerf.core.geometry import ray_box
 from dnerf.core.rays import Rays
 from dnerf.data.frames import Frames
 
-OPAQUE = 26  # alpha, of 255, from which a pixel shows something: a tenth, so that the rims of fog count
+# Alpha, or difference from the colour behind, of 255, from which a pixel shows something: a tenth, so that the rims of
+# fog count.
+OPAQUE = 26
 NUM_BLOCKS = 100  # of pixels along an image's longer side, each opaque if one of its pixels is
 MAX_RAYS = 12_000  # of outlines, evenly spread over all views: half a second on one core
 NUM_DISTANCES = 48  # along each
@@ -46,12 +48,12 @@ class Silhouettes:
     distances: Tensor
 
     @classmethod
-    def of(cls, frames: Frames) -> "Silhouettes":
-        """The silhouettes of frames with alpha."""
+    def of(cls, frames: Frames, behind: Tensor | None = None) -> "Silhouettes":
+        """The silhouettes of frames with alpha, or before a colour (3,) in [0, 1]."""
         block = -(-max(max(size) for size in frames.layout.sizes) // NUM_BLOCKS)
         order = frames.times.argsort(stable=True)
         rows = order.tolist()
-        blocks = [max_pool2d(frames.stored_image(i)[None, ..., 3].float(), block, ceil_mode=True) for i in rows]
+        blocks = [max_pool2d(shown(frames, i, behind)[None], block, ceil_mode=True) for i in rows]
         sizes = [each.shape[1:] for each in blocks]
         height, width = (max(size[axis] for size in sizes) for axis in (0, 1))
         blocks = [pad(each, (0, width - each.shape[2], 0, height - each.shape[1])) for each in blocks]
@@ -149,14 +151,14 @@ def carve(silhouettes: Silhouettes, box: Tensor) -> Tensor | None:
     return torch.stack([(positions - room[:, None]).amin(0), (positions + room[:, None]).amax(0)])
 
 
-def hold_opaque(frames: Frames, box: Tensor) -> Tensor:
+def hold_opaque(frames: Frames, box: Tensor, behind: Tensor | None = None) -> Tensor:
     """A box (2, 3), grown until no opaque pixel looks past it: to the position on its ray that is nearest to the box.
 
     One of `EVERY_PIXEL` squared pixels of each view is looked at.
     """
     steps = torch.linspace(0, 1, NUM_DISTANCES, device=box.device)
     for index in range(len(frames)):
-        rays = opaque_rays(frames, index)
+        rays = opaque_rays(frames, index, behind)
         enter, leave = ray_box(rays.origins, rays.directions, box)
         past = rays[((enter > leave) | (leave < rays.near) | (enter > rays.far)).nonzero()[:, 0]]
         distances = past.near[:, None] + (past.far - past.near)[:, None] * steps
@@ -167,11 +169,18 @@ def hold_opaque(frames: Frames, box: Tensor) -> Tensor:
     return box
 
 
-def opaque_rays(frames: Frames, index: int) -> Rays:
+def opaque_rays(frames: Frames, index: int, behind: Tensor | None = None) -> Rays:
     """The rays of one in `EVERY_PIXEL` squared opaque pixels of a frame."""
-    image = frames.stored_image(index)
-    rows, columns = (image[::EVERY_PIXEL, ::EVERY_PIXEL, 3] >= OPAQUE).nonzero().unbind(-1)
-    return frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * image.shape[1] + columns))
+    levels = shown(frames, index, behind)
+    rows, columns = (levels[::EVERY_PIXEL, ::EVERY_PIXEL] >= OPAQUE).nonzero().unbind(-1)
+    return frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * levels.shape[1] + columns))
+
+
+def shown(frames: Frames, index: int, behind: Tensor | None) -> Tensor:
+    """How much of something each pixel shows, (H, W) float32 in [0, 255]: its alpha, or with a colour (3,) in [0, 1]
+    behind opaque images, the largest difference from it. What has that colour itself needs no density."""
+    image = frames.stored_image(index).float()
+    return image[..., 3] if behind is None else (image[..., :3] - 255 * behind.to(image)).abs().amax(-1)
 
 
 def _dilated(blocks: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics
 from dnerf.core.geometry import box_planes
+from dnerf.data.background_check import background_color
 from dnerf.data.bounds import check_views, fit_box, opaque_without_room
 from dnerf.data.frames import Frames
 from dnerf.data.normalization import LONGEST_SIDE, Similarity, Vector, upright
@@ -85,7 +86,7 @@ def _fitted(
     x, y, z = middle.tolist()
     rough = Similarity(2 * DISTANCE / (near + far), upright(up), (x, y, z))
     frames = make_frames(rough.poses_to_world(poses).float(), (near * rough.scale, far * rough.scale))
-    if not frames.is_transparent:
+    if not frames.is_transparent and background_color(frames) is None:
         near = near if given.near is None else given.near
         far = far if given.far is None else given.far
         near, far = (near, far) if near < far else (near, 3 * near) if given.far is None else (far / 3, far)
@@ -148,10 +149,12 @@ def _around_origin(halves: Sequence[float]) -> Box:
 def _about_box(world: World, frames: Frames, given: Given) -> str:
     if given.box is not None:
         by = "as given"
-    elif frames.is_transparent:
+    elif given.points is not None and not frames.is_transparent:
+        by = "fitted to sparse points"
+    elif frames.is_transparent or background_color(frames) is not None:
         by = "fitted to what the images show"
     else:
-        by = "fitted to sparse points" if given.points is not None else "fitted to what the cameras see"
+        by = "fitted to what the cameras see"
     corners = ", ".join(_short(corner) for corner in world.similarity.box_from_world(world.box).tolist())
     return (
         f"box: [{corners}] in the data's units, {by}; its middle is the world's origin, one unit "

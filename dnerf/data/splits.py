@@ -46,7 +46,7 @@ def split_frames(capture: Capture, hold_out: int | None = 8, times: str = "auto"
         if held and len(held) < len(splits["train"]):
             splits["train"] = tuple(frame for frame in splits["train"] if frame not in held)
             splits["test"] = held
-            notes.append(f"there is no test split: {_listed(held)} are held out (data.hold_out={hold_out})")
+            notes.append(f"there is no test split: {_listed(held)} held out (data.hold_out={hold_out})")
     return SplitFrames(splits, clock, tuple(notes))
 
 
@@ -89,4 +89,4 @@ def _timed(capture: Capture, times: str) -> tuple[dict[str, tuple[CaptureFrame, 
 def _listed(frames: Sequence[CaptureFrame]) -> str:
     names = ", ".join(frame.name for frame in frames[:NAMED])
     more = f" and {len(frames) - NAMED} more" if len(frames) > NAMED else ""
-    return f"{len(frames)} frames ({names}{more})"
+    return f"{len(frames)} frame{'s' * (len(frames) > 1)} ({names}{more})"

@@ -27,7 +27,7 @@ def test_every_eighth_frame_is_held_out_and_named() -> None:
     made = split_frames(capture(all=frames([i / 19 for i in range(20)])))
     assert [frame.name for frame in made.splits["test"]] == ["r_4", "r_12"]
     assert len(made.splits["train"]) == 18
-    assert any("2 frames (r_4, r_12) are held out" in note for note in made.notes)
+    assert any("2 frames (r_4, r_12) held out" in note for note in made.notes)
     assert "test" not in split_frames(capture(all=frames([0.0, 1.0])), None).splits
     assert "test" not in split_frames(capture(all=frames([0.5]))).splits
 

@@ -19,7 +19,9 @@ def around(count: int = 20) -> Tensor:
     return random_views(count)[0].double()
 
 
-def moved(poses: Tensor, turn: Tensor = TURN, scale: float = 50.0, shift: tuple[float, ...] = (9.0, -4.0, 7.0)) -> Tensor:
+def moved(
+    poses: Tensor, turn: Tensor = TURN, scale: float = 50.0, shift: tuple[float, ...] = (9.0, -4.0, 7.0)
+) -> Tensor:
     result = poses.clone()
     result[:, :3, :3] = turn @ poses[:, :3, :3]
     result[:, :3, 3] = scale * (poses[:, :3, 3] @ turn.T) + torch.tensor(shift, dtype=torch.float64)
@@ -75,7 +77,9 @@ def test_planes_follow_sparse_points() -> None:
 
 def test_cameras_side_by_side_or_looking_outwards_have_no_focus() -> None:
     rows = torch.stack([look_at((float(x), -4.0, 0.0), (float(x), 0.0, 0.0)) for x in range(5)]).double()
-    outwards = torch.stack([look_at((math.cos(a), math.sin(a), 0), (9 * math.cos(a), 9 * math.sin(a), 0)) for a in range(6)])
+    outwards = torch.stack(
+        [look_at((math.cos(a), math.sin(a), 0), (9 * math.cos(a), 9 * math.sin(a), 0)) for a in range(6)]
+    )
     for poses in (rows, outwards.double()):
         assert common_focus(views(poses)) is None
         assert "guessed" in find_planes(views(poses), None)[2]

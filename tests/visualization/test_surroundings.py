@@ -15,7 +15,9 @@ from dnerf.visualization import Surroundings
 LENS = Intrinsics.from_angle(40, 30, 0.7)
 
 
-def ring(degrees: float, count: int = 24, radius: float = 3.0, rise: float = 0.5, around: tuple = (0.0, 0.0, 0.0)) -> Tensor:
+def ring(
+    degrees: float, count: int = 24, radius: float = 3.0, rise: float = 0.5, around: tuple = (0.0, 0.0, 0.0)
+) -> Tensor:
     angles = [math.radians(degrees) * i / count for i in range(count)]
     eyes = [(math.cos(rise) * math.cos(a), math.cos(rise) * math.sin(a), math.sin(rise)) for a in angles]
     return torch.stack([look_at([c + radius * e for c, e in zip(around, eye)], around) for eye in eyes])
