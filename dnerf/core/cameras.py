@@ -93,7 +93,7 @@ class Intrinsics:
         focal_x, focal_y, column, row = self.pinhole
         if self.distortion is not None:
             x, y = (columns.double() - column) / focal_x, (rows.double() - row) / focal_y
-            x, y = undistort(self.distortion.model, self.distortion.coefficients, x, y, self.region().iterations)
+            x, y = undistort(self.distortion.model, self.distortion.coefficients, x, y, self.region())
             return torch.stack([x, -y, -torch.ones_like(x)], dim=-1).to(dtype)
         x = (columns.to(dtype) - column) / focal_x
         y = (row - rows.to(dtype)) / focal_y

@@ -30,8 +30,8 @@ class RayIntrinsics:
             return torch.stack([x, y, -torch.ones_like(x)], dim=-1)
         focal_x, focal_y, column, row = self.values[:, PINHOLE].unbind(-1)
         x, y = (columns.double() - column) / focal_x, (rows.double() - row) / focal_y
-        coefficients = self.values[:, COEFFICIENTS].unbind(-1)
-        x, y = self._chosen([undistort(model, coefficients, x, y, self.iterations) for model in self.models])
+        coefficients, region = self.values[:, COEFFICIENTS].unbind(-1), (self.values[:, RADIUS], self.iterations)
+        x, y = self._chosen([undistort(model, coefficients, x, y, region) for model in self.models])
         return torch.stack([x, -y, -torch.ones_like(x)], dim=-1).to(dtype)
 
     def seen_at(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

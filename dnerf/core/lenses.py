@@ -16,10 +16,12 @@ from torch import Tensor
 from dnerf.core.checks import check_choice
 
 MODELS = ("opencv", "fisheye")
-MAX_ANGLE = math.radians(89)  # from the axis: directions are stored as positions in the plane at depth 1
-GRID = 33  # positions along each side of an image at which a lens is examined
-STEPS = 64  # from the axis to each of them
-MAX_ITERATIONS = 60  # that Newton's method may take
+MAX_DEGREES = 89  # from the axis: directions are stored as positions in the plane at depth 1
+NUM_RADII = 1781  # every twentieth of a degree
+ROOM = 1.05  # around the image, for what lies beside it and tangential distortion
+SIDE = 9  # positions along each side of an image at which a lens is examined: the most distorted ones
+STEPS = 33  # from the axis to each of them
+ITERATIONS = (*range(1, 7), 8, 12, 20, 40)  # of Newton's method, the first that suffice; four are usual
 TOLERANCE = 1e-11  # of the plane: 1e-7 pixels at a focal length of 10,000
 LEAST = 1e-12  # of a radius that is divided by
 
@@ -62,8 +64,8 @@ class Distortion:
 class Region(NamedTuple):
     """What is known of a lens within an image."""
 
+    radius: float  # in the plane at depth 1, undistorted, that holds the image, and within which the lens does not fold
     iterations: int  # of Newton's method, that undistort all of the image
-    radius: float  # undistorted, in the plane at depth 1, of the pixel furthest from the axis
 
 
 def distort(model: str, coefficients: Coefficients, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,35 +78,39 @@ def distort(model: str, coefficients: Coefficients, x: Tensor, y: Tensor) -> tup
 
 
 def undistort(
-    model: str, coefficients: Coefficients, x: Tensor, y: Tensor, iterations: int = MAX_ITERATIONS
+    model: str, coefficients: Coefficients, x: Tensor, y: Tensor, region: tuple[float | Tensor, int]
 ) -> tuple[Tensor, Tensor]:
-    """The inverse of `distort`, by Newton's method from the distorted positions; float64 reaches 1e-6 pixels."""
+    """The inverse of `distort` within a radius, by so many iterations of Newton's method; exact in float64."""
+    radius, iterations = region
+    distorted = (x * x + y * y).sqrt().clamp(min=LEAST)
     if model == "fisheye":
-        distorted = (x * x + y * y).sqrt().clamp(min=LEAST)
-        theta = distorted
+        largest = torch.as_tensor(radius, dtype=x.dtype, device=x.device).atan()
+        theta = distorted.minimum(largest)
         for _ in range(iterations):
             value, slope = _fisheye(coefficients, theta)
-            theta = (theta - (value - distorted) / slope).clamp(0, 0.5 * math.pi)
+            theta = (theta - (value - distorted) / slope).clamp(min=0).minimum(largest)
         scale = theta.tan() / distorted
         return x * scale, y * scale
-    u, v = x, y
+    u, v = _within(radius, x, y)
     for _ in range(iterations):
         value_x, value_y, xx, xy, yy = _opencv(coefficients, u, v)
         error_x, error_y = value_x - x, value_y - y
         determinant = xx * yy - xy * xy
         u, v = u - (yy * error_x - xy * error_y) / determinant, v - (xx * error_y - xy * error_x) / determinant
+        u, v = _within(radius, u, v)
     return u, v
 
 
 def project_beyond(
     model: str, coefficients: Coefficients, radius: float | Tensor, x: Tensor, y: Tensor
-) -> list[Tensor]:
+) -> tuple[Tensor, Tensor]:
     """`distort` up to a radius, and straight outwards beyond it.
 
     Polynomials fold over somewhere beyond the image; what lies there must not be projected into it.
     """
     excess = ((x * x + y * y).sqrt() / radius).clamp(min=1)
-    return [value * excess for value in distort(model, coefficients, x / excess, y / excess)]
+    u, v = distort(model, coefficients, x / excess, y / excess)
+    return u * excess, v * excess
 
 
 @lru_cache(maxsize=4096)
@@ -115,39 +121,44 @@ def examine(distortion: Distortion, left: float, right: float, top: float, botto
         ValueError: if the lens folds over inside the image, or sees 89 degrees or more from its axis.
     """
     model, coefficients = distortion.model, distortion.coefficients
-    rows, columns = (torch.linspace(*ends, GRID, dtype=torch.float64) for ends in ((top, bottom), (left, right)))
-    y, x = (values.reshape(-1) for values in torch.meshgrid(rows, columns, indexing="ij"))
-    u, v = undistort(model, coefficients, x, y)
-    radius = float((u * u + v * v).sqrt().amax())
-    steps = torch.linspace(0, 1, STEPS, dtype=torch.float64)[:, None]
-    found = distort(model, coefficients, u, v)
-    is_inverse = max(float((found[0] - x).abs().amax()), float((found[1] - y).abs().amax())) <= TOLERANCE
+    share = torch.linspace(0, 1, SIDE, dtype=torch.float64)
+    x, y = left + share * (right - left), top + share * (bottom - top)
+    x = torch.cat([x, x, torch.full_like(x, left), torch.full_like(x, right)])
+    y = torch.cat([torch.full_like(y, top), torch.full_like(y, bottom), y, y])
+    radius = _radius(model, coefficients, ROOM * float((x * x + y * y).sqrt().amax()))
+    for iterations in ITERATIONS:
+        u, v = undistort(model, coefficients, x, y, (radius, iterations))
+        again = distort(model, coefficients, u, v)
+        error = torch.maximum((again[0] - x).abs(), (again[1] - y).abs()).amax()
+        if bool(error <= TOLERANCE) and _is_even(model, coefficients, u, v):
+            # One more for what lies between these positions.
+            return Region(radius, iterations + 1)
+    raise ValueError(
+        f"distortion must not fold over inside the image, nor see {MAX_DEGREES} degrees from the axis, got "
+        f"{distortion}; its coefficients may be of another model or image size; undistort the images, or crop them"
+    )
+
+
+def _is_even(model: str, coefficients: Coefficients, u: Tensor, v: Tensor) -> bool:
+    """Whether nothing folds between the axis and positions; a fisheye's radius tells."""
     if model == "fisheye":
-        reached = math.degrees(math.atan(radius))
-        if reached >= math.degrees(MAX_ANGLE):
-            raise ValueError(
-                f"distortion must see less than {math.degrees(MAX_ANGLE):.0f} degrees from the axis inside the image, "
-                f"got {distortion}; crop the images and move the principal point by as much, or undistort them"
-            )
-        turns = bool((_fisheye(coefficients, steps * math.atan(radius))[1] <= 0).any())
-    else:
-        *_, xx, xy, yy = _opencv(coefficients, steps * u, steps * v)
-        turns = not bool(((xx * yy - xy * xy > 0) & (xx + yy > 0)).all())
-    if turns or not is_inverse:
-        raise ValueError(
-            f"distortion must not fold over inside the image, got {distortion}; its coefficients may be of another "
-            "model or image size; undistort the images, or crop them to what the lens is calibrated for"
-        )
-    return Region(_iterations(model, coefficients, x, y, u, v), radius)
+        return True
+    steps = torch.linspace(0, 1, STEPS, dtype=torch.float64)[:, None]
+    *_, xx, xy, yy = _opencv(coefficients, steps * u, steps * v)
+    return bool(((xx * yy - xy * xy > 0) & (xx + yy > 0)).all())
 
 
-def _iterations(model: str, coefficients: Coefficients, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> int:
-    """Steps of Newton's method that undistort positions, and one more for what lies between them."""
-    for number in range(1, MAX_ITERATIONS):
-        found = undistort(model, coefficients, x, y, number)
-        if max(float((found[0] - u).abs().amax()), float((found[1] - v).abs().amax())) <= TOLERANCE:
-            return number + 1
-    return MAX_ITERATIONS
+def _radius(model: str, coefficients: Coefficients, distorted: float) -> float:
+    """The radius up to which a lens does not fold, at most that which it puts at a distorted one."""
+    radii = torch.linspace(0, math.radians(MAX_DEGREES), NUM_RADII, dtype=torch.float64).tan()
+    found = distort(model, (*coefficients[:6], 0.0, 0.0), radii, torch.zeros_like(radii))[0]
+    is_end = (found[1:] <= found[:-1]) | (found[:-1] >= distorted)
+    return float(radii[int(is_end.int().argmax())] if bool(is_end.any()) else radii[-1])
+
+
+def _within(radius: float | Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    scale = (radius / (x * x + y * y).sqrt().clamp(min=LEAST)).clamp(max=1)
+    return x * scale, y * scale
 
 
 def _fisheye(k: Coefficients, theta: Tensor) -> tuple[Tensor, Tensor]:
