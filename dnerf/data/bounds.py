@@ -136,9 +136,9 @@ def check_views(frames: Frames, box: Tensor, similarity: Similarity = IDENTITY) 
 
 
 def opaque_without_room(frames: Frames, box: Tensor) -> float:
-    """The share of opaque pixels of images with alpha whose rays miss the box (2, 3) between the planes, so that nothing explains them.
+    """The share of opaque pixels whose rays miss the box (2, 3) between the planes: nothing can explain them.
 
-    One of `EVERY_PIXEL` squared pixels of each view is looked at.
+    Images have alpha. One of `EVERY_PIXEL` squared pixels of each view is looked at.
     """
     count = missed = 0
     for index in range(len(frames)):

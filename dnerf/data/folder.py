@@ -142,7 +142,7 @@ class FolderData(DataSource):
 
     def _is_learnt(self, frame: CaptureFrame) -> bool:
         has_image = frame.image is not None and frame.image.path.exists()
-        return has_image and (self.train_end is None or float(_times([frame])[0]) <= self.train_end)
+        return has_image and (self.train_end is None or bool(_times([frame])[0] <= self.train_end))
 
     def _load(self, split: str) -> LoadedFrames:
         frames = [frame for frame in self._split.splits[split] if frame.image is not None]

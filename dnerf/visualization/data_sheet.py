@@ -28,7 +28,8 @@ def data_sheet(scene: SceneRecord, frames: Frames) -> Tensor:
         scene: the data set's record.
         frames: its training frames.
     """
-    corners = torch.lerp(*torch.tensor(scene.world.box), cube_corners(torch.device("cpu")).float())
+    low, high = torch.tensor(scene.world.box)
+    corners = torch.lerp(low, high, cube_corners(low.device).float())
     plans = [_plan(scene, frames, corners, axes, name) for axes, name in (((0, 1), "from above"), ((0, 2), "the side"))]
     chosen = sorted({0, len(frames) // 2, len(frames) - 1}, key=lambda index: float(frames.times[index]))
     images = [_with_box(frames, index, corners) for index in chosen]
@@ -60,7 +61,7 @@ def _plan(scene: SceneRecord, frames: Frames, corners: Tensor, axes: tuple[int, 
         draw.line(project(ends), fill=PLANES)
     for a, b in EDGES:
         draw.line(project(corners[[a, b]]), fill=BOX, width=2)
-    for split, cameras in reversed(scene.cameras.items()):
+    for split, cameras in sorted(scene.cameras.items(), key=lambda item: item[0] == "train"):
         color = TRAIN if split == "train" else OTHER
         reach = 14 / scale
         for pose in cameras.poses:

@@ -43,9 +43,7 @@ def test_a_format_s_up_stays_unless_level_cameras_are_held_otherwise() -> None:
     assert choose_up(views(around()), z) == (z, "as the format says")
     assert choose_up(views(around()), None)[0] == z
     y_up = moved(around(), torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double(), 1.0, (0.0, 0.0, 0.0))
-    assert choose_up(views(y_up), z) == ((0.0, -1.0, 0.0), "as the cameras are held") or choose_up(views(y_up), z)[0] == (
-        0.0, 1.0, 0.0,
-    )  # fmt: skip
+    assert choose_up(views(y_up), z) == ((0.0, 1.0, 0.0), "as the cameras are held")
     # One camera that looks down by 60 degrees says little.
     steep = look_at((0.0, -1.0, math.sqrt(3)))[None].double().expand(5, 4, 4)
     assert choose_up(views(steep), z) == (z, "as the format says")
