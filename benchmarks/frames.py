@@ -74,7 +74,7 @@ def _measure(models: Mapping[str, Mapping[str, Any]], settings: Settings, scale:
     options = settings.options
     frames: Frames = models[OWN]["data"].frames(options["split"]).to(settings.device)
     chosen = spread_indices(len(frames), 1 if settings.quick else options["num_frames"])
-    camera = frames.intrinsics
+    camera = frames.intrinsics[0]
     size = camera if scale == 1 else camera.resized(round(camera.width * scale), round(camera.height * scale))
     renderers: dict[str, Renderer] = {way: parts["renderer"].to(settings.device) for way, parts in models.items()}
     background = renderers[OWN].background.eval()(torch.zeros(1, 3, device=settings.device))[0]

@@ -33,7 +33,7 @@ def _cell_cases(work: Workload) -> list[Case]:
     lows, ends = cells * DISPLACEMENTS // len(occupied), -(-(cells + 1) * DISPLACEMENTS // len(occupied)) + 1
     covering = partial(covered_places, lows, ends, (side,) * 3)
     camera = Camera(Intrinsics.from_angle(400, 400, 0.7), look_at((2.5, 2.5, 1.5)))
-    view = partial(footprints, occupied, work.box, camera.pose, camera.intrinsics.lens, (400, 400))
+    view = partial(footprints, occupied, work.box, camera.pose, camera.intrinsics.pinhole, (400, 400))
     covered = view()
     num_pixels = 0 if covered is None else len(covered.pixels)
     return [

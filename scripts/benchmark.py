@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from hydra_app import build, load_config, load_renderer, resolve_device, run_app
+from hydra_app import build, load_config, load_renderer, load_scene, resolve_device, run_app
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # `benchmarks` is no part of the installed package
 
@@ -16,11 +16,10 @@ import torch
 import yaml
 from hydra import compose
 from omegaconf import DictConfig, OmegaConf
-from train import in_box
+from train import suited
 
 from benchmarks import Settings, describe_machine, num_threads, run_suite, suite_names, write_report
 from dnerf.core.checks import check_positive
-from dnerf.training.distributed import Processes
 
 ALL = "all"
 
@@ -67,7 +66,8 @@ def _parts(overrides: Sequence[str]) -> Mapping[str, Any]:
     """Renderer, trainer, data and chunk of a training config with the given overrides."""
     config = compose("train", list(overrides))
     data = build(config.data, trusted=True)
-    config = in_box(config, data, data.frames("train"), Processes())
+    world = data.world()
+    config, _ = suited(config, world, data.frames("train"))
     parts = {name: build(config[name], trusted=True) for name in ("renderer", "trainer")}
     return {"chunk": config.chunk, "data": data, **parts}
 
@@ -84,7 +84,9 @@ def _finished(run: str, overrides: Sequence[str]) -> Mapping[str, Any]:
             raise ValueError(f"frames.ways: {run} has no setting {name}")
         OmegaConf.update(config, name, yaml.safe_load(text))
     renderer = load_renderer(run, config, torch.device("cpu"))
-    return {"renderer": renderer, "data": build(config.data), "chunk": config.chunk}
+    data = build(config.data)
+    data.settle(load_scene(run).world)
+    return {"renderer": renderer, "data": data, "chunk": config.chunk}
 
 
 if __name__ == "__main__":

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra_app import build, load_config, load_renderer, moved, resolve_device, run_app
+from hydra_app import build, load_config, load_renderer, load_scene, moved, resolve_device, run_app
 from omegaconf import DictConfig
-from reporting import camera_split, evaluate_run, print_scores
+from reporting import evaluate_run, on_background_of, print_scores
 from torch import Tensor
 
 from dnerf.core.backgrounds import ConstantBackground
@@ -17,7 +17,8 @@ from dnerf.core.cameras import Camera
 from dnerf.core.compositing import Rendering
 from dnerf.core.files import write_json, write_text
 from dnerf.core.rays import Rays
-from dnerf.data import DataSource, Frames, SyntheticData, random_views, render_exact
+from dnerf.data import DataSource, Frames, SceneRecord, SyntheticData, random_views, render_exact
+from dnerf.data.placing import planes_between
 from dnerf.evaluation import FrameScore, check_consistency, evaluate, evaluate_over_time, lpips_metric
 from dnerf.evaluation.plots import frame_curves
 from dnerf.evaluation.protocols import LEGO, Protocol, csv_table, find_protocol, markdown_table, table_json, table_notes
@@ -59,7 +60,9 @@ def _score(config: DictConfig, run: str, protocol: Protocol | None, lpips: Lpips
     split = config.split or (protocol.split if protocol is not None else "test")
     if scene == LEGO and config.lego_split is not None:
         split = config.lego_split
+    record = load_scene(run)
     renderer, data = load_renderer(run, saved, resolve_device(config.device)), build(saved.data)
+    data.settle(record.world)
     if protocol is not None:
         if not data.frames(split).has_alpha:
             raise ValueError(f"protocol: {protocol.name} composites on {protocol.background}, {run} has no alpha")
@@ -82,9 +85,9 @@ def _score(config: DictConfig, run: str, protocol: Protocol | None, lpips: Lpips
     if config.plots:
         _write_curves(folder / f"curves_{split}.svg", {scene: metrics["frames"]})
     if config.temporal.enabled:
-        _write_temporal(config, folder, renderer, data, chunk, settings)
+        _write_temporal(config, folder, renderer, data, record, chunk, settings)
     if config.consistency:
-        _write_consistency(folder, renderer, data, settings)
+        _write_consistency(folder, renderer, data, record, settings)
     return metrics
 
 
@@ -115,7 +118,8 @@ def _write_worst(
     def keep(score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
         pairs.append((prediction, truth))
 
-    evaluate(renderer, frames.subset([frame["index"] for frame in worst]), chunk=chunk, on_frame=keep)
+    with on_background_of(frames, renderer):
+        evaluate(renderer, frames.subset([frame["index"] for frame in worst]), chunk=chunk, on_frame=keep)
     labels = [f"frame {frame['index']}, t = {frame['time']:.2f}, {frame['psnr']:.1f} dB" for frame in worst]
     path = folder / f"worst_frames_{metrics['split']}.png"
     write_png(comparison_sheet(pairs, labels), path)
@@ -133,10 +137,11 @@ def _write_curves(path: Path, runs: dict[str, Any]) -> None:
 
 
 def _write_temporal(
-    config: DictConfig, folder: Path, renderer: Renderer, data: DataSource, chunk: int, settings: dict[str, Any]
-) -> None:
+    config: DictConfig, folder: Path, renderer: Renderer, data: DataSource, record: SceneRecord, chunk: int,
+    settings: dict[str, Any],
+) -> None:  # fmt: skip
     size = config.temporal.resolution
-    camera = _first_camera(data, size, renderer.device)
+    camera = _first_camera(record, size, renderer.device)
     scene = data.scene.to(renderer.device) if isinstance(data, SyntheticData) else None
     scores = evaluate_over_time(renderer, camera, scene, num_frames=config.temporal.num_frames, chunk=chunk)
     values = scores.as_dict()
@@ -149,14 +154,17 @@ def _write_temporal(
     print(f"over time:     {folder / 'temporal.json'}")
 
 
-def _first_camera(data: DataSource, width: int, device: torch.device) -> Camera:
+def _first_camera(record: SceneRecord, width: int, device: torch.device) -> Camera:
     """The first camera of the test split, or of the train split if there is none, with so many pixels."""
-    frames = data.frames(camera_split(None, data))
-    height = round(width * frames.intrinsics.height / frames.intrinsics.width)
-    return Camera(frames.intrinsics.resized(width, height), frames.poses[0].to(device), frames.near, frames.far)
+    _, cameras = record.split(None)
+    intrinsics, pose = cameras.intrinsics[0], cameras.poses[0]
+    resized = intrinsics.resized(width, max(1, round(width * intrinsics.height / intrinsics.width)))
+    return Camera(resized, pose.to(device), *planes_between(cameras.poses, record.world))
 
 
-def _write_consistency(folder: Path, renderer: Renderer, data: DataSource, settings: dict[str, Any]) -> None:
+def _write_consistency(
+    folder: Path, renderer: Renderer, data: DataSource, record: SceneRecord, settings: dict[str, Any]
+) -> None:
     truth: Callable[[Rays], Rendering] | None = None
     times: list[float] = []
     if isinstance(data, SyntheticData):
@@ -164,8 +172,10 @@ def _write_consistency(folder: Path, renderer: Renderer, data: DataSource, setti
         last = 1.0 if data.train_end is None else data.train_end
         times = [time for time in random_views(data.num_frames["train"])[1].tolist() if time <= last]
     slabs = len(renderer.sampler.grid.occupied) if isinstance(renderer.sampler, OccupancySampler) else 1
-    rays = _first_camera(data, CONSISTENCY_PIXELS, renderer.device).rays(0.0)
-    findings = check_consistency(renderer, rays, data.box, slabs=slabs, truth=truth, train_times=times)
+    rays = _first_camera(record, CONSISTENCY_PIXELS, renderer.device).rays(0.0)
+    findings = check_consistency(
+        renderer, rays, torch.tensor(record.world.box), slabs=slabs, truth=truth, train_times=times
+    )
     print("\n".join([f"{'check':20} {'verdict':13} {'value':>9} {'bound':>9}", *map(str, findings)]))
     listed = [{**vars(finding), "value": _finite(finding.value)} for finding in findings]
     write_json(folder / "consistency.json", {"checks": listed, **settings, **provenance()})

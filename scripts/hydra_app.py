@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import signal
 import sys
 import traceback
@@ -23,6 +24,7 @@ from settings import check_settings
 
 import dnerf
 from dnerf.core.process import prepare_process
+from dnerf.data import SceneRecord
 from dnerf.rendering.renderer import Renderer
 from dnerf.training import runs
 from dnerf.training.distributed import LostProcess, is_launched
@@ -31,6 +33,8 @@ from dnerf.training.signals import TrainingStopped
 WRONG_INPUT = 2
 USER_ERRORS = (ValueError, OSError, MemoryError, LostProcess, HydraException, OmegaConfBaseException)
 NO_MEMORY = "DefaultCPUAllocator"
+PATHS = ("data.root", "data_root", "out_dir", "run", "output", "out", "table", "path.file", "path.transforms")
+PLAIN = re.compile(r"(\.{0,2}/|[A-Za-z_])[A-Za-z0-9_./:-]*")  # no number, nothing that Hydra's grammar knows
 CONF = str(Path(__file__).resolve().parents[1] / "conf")
 
 
@@ -43,9 +47,32 @@ def run_app(main: Callable[[DictConfig], None], config_name: str) -> None:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     _tell_workers_where_we_are()
     prepare_process()
+    is_sweep = any(word in ("--multirun", "-m") for word in sys.argv[1:])
+    sys.argv[1:] = [quoted_path(word, is_sweep=is_sweep) for word in sys.argv[1:]]
     with _one_line_errors():
         hydra.main(version_base="1.3", config_path=CONF, config_name=config_name)(_as_job(main, config_name))()
         sweeps.finish()
+
+
+def quoted_path(word: str, *, is_sweep: bool = False) -> str:
+    """A word of a command line as Hydra has to have it, where it sets a path: people type paths as their shell wants.
+
+    `~` becomes the home folder. Left alone are null, what is quoted already, interpolations, and lists of a sweep.
+    """
+    key, equals, value = word.partition("=")
+    if key.lstrip("+") not in PATHS or not equals or value in ("", "null", "???") or "${" in value:
+        return word
+    if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
+        return word
+    if is_sweep and re.search(r"[,()]", value):
+        return word
+    value = os.path.expanduser(value)
+    if PLAIN.fullmatch(value) and value.lower() not in ("true", "false", "nan", "inf"):
+        return f"{key}={value}"
+    # Backslashes count before a quote alone; the closing one is such.
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", value)
+    escaped += "\\" * (len(escaped) - len(escaped.rstrip("\\")))
+    return f"{key}='{escaped}'"
 
 
 def _as_job(main: Callable[[DictConfig], None], script: str) -> Callable[[DictConfig], None]:
@@ -203,6 +230,11 @@ def load_config(run: str) -> DictConfig:
     config = OmegaConf.create(runs.load_config(run))
     assert isinstance(config, DictConfig)
     return config
+
+
+def load_scene(run: str) -> SceneRecord:
+    """The cameras, times and world of a run's data set; ValueError as `SceneRecord.read`."""
+    return SceneRecord.read(run)
 
 
 def load_renderer(run: str, config: DictConfig, device: torch.device) -> Renderer:

@@ -59,26 +59,31 @@ def given_overrides(folder: Path) -> list[str]:
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else list(HydraConfig.get().overrides.task)
 
 
-def as_decided(config: DictConfig, folder: Path, box: Any) -> DictConfig:
-    """The config, in a box, with what was decided when the run in a folder began; as it is, if nothing was."""
+def as_decided(config: DictConfig, folder: Path) -> DictConfig:
+    """The config with what was decided when the run in a folder began; as it is, if nothing was."""
     parts = parts_of(config)
     if not parts or not (folder / FILE).is_file():
         return config
     saved = load_plan(folder / FILE).choices
     choices = {name: part.named(name, saved.get(name, part.default)) for name, part in parts.items()}
-    return composed(parts, choices, box, list(HydraConfig.get().overrides.task))
+    return composed(parts, choices, list(HydraConfig.get().overrides.task))
 
 
-def composed(parts: Mapping[str, Part], choices: Mapping[str, str], box: Any, task: Sequence[str]) -> DictConfig:
-    """The resolved config of a training run with some choices, as overrides and the box have it otherwise."""
+def composed(parts: Mapping[str, Part], choices: Mapping[str, str], task: Sequence[str]) -> DictConfig:
+    """The config of a training run with some choices, as overrides have it otherwise; without the plan."""
     chosen = [override for name, part in parts.items() for override in part.candidates[choices[name]]]
     mine = {_key(override) for override in task}
     config = compose("train", [*(x for x in chosen if _key(x) not in mine), *task])
-    if box is not None:
-        config.data.box = box
-    config = resolved(config)
     config.pop("plan", None)
     return config
+
+
+def as_planned(config: DictConfig, parts: Mapping[str, Part], choices: Mapping[str, str], folder: Path) -> DictConfig:
+    """The resolved config of the run in a folder with some choices, and with what was found in its data."""
+    planned = composed(parts, choices, given_overrides(folder))
+    for name in ("box", "background"):
+        planned[name] = config[name]
+    return resolved(planned)
 
 
 def decide(
@@ -86,10 +91,9 @@ def decide(
 ) -> tuple[Plan, Run | None]:
     """The plan, and what its trials have begun; ValueError as of `given_choices`."""
     given = given_choices(config, parts, fingerprint(frames), folder)
-    box = OmegaConf.to_container(config.data.box) if "box" in config.data else None
 
     def make(choices: Mapping[str, str]) -> tuple[Renderer, Trainer]:
-        candidate = composed(parts, choices, box, given_overrides(folder))
+        candidate = as_planned(config, parts, choices, folder)
         torch.manual_seed(candidate.seed)
         return build(candidate.renderer, trusted=True).to(device), build(candidate.trainer, trusted=True)
 

@@ -1,15 +1,17 @@
 """What training and evaluation both report: metrics.json, a contact sheet, a table."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from dnerf.core.backgrounds import COLORS
+from dnerf.core.backgrounds import COLORS, ConstantBackground, parse_color
 from dnerf.core.files import write_json
-from dnerf.data import DataSource
+from dnerf.data import DataSource, Frames
+from dnerf.data.background_check import SAME_LEVELS
 from dnerf.evaluation import FrameScore, evaluate, scores_by_time, spread_indices
 from dnerf.evaluation.provenance import provenance
 from dnerf.rendering.renderer import Renderer
@@ -58,13 +60,15 @@ def evaluate_run(
             pairs.append((prediction, truth))
             labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")
 
-    evaluation = evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep, lpips=lpips)
+    with on_background_of(frames, renderer):
+        evaluation = evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep, lpips=lpips)
+        background = _color_name(renderer)
     metrics = {
         **evaluation.as_dict(),
         **training,
         "frames_of_split": len(frames),
-        "resolution": frames.intrinsics.width,
-        "background": _color_name(renderer),
+        "resolution": frames.intrinsics[0].width,
+        "background": background,
         **(settings or {}),
         **provenance(),
     }
@@ -75,16 +79,27 @@ def evaluate_run(
     return metrics
 
 
-def camera_split(split: str | None, data: DataSource) -> str:
-    """The split whose cameras are taken where frames do not matter: the one named, else test, else train."""
-    if split is not None:
-        return split
+@contextmanager
+def on_background_of(frames: Frames, renderer: Renderer) -> Iterator[None]:
+    """Render before what opaque frames were taken before, where that is known and another than the model's.
+
+    A model of images with alpha goes with any; its prediction must be compared on the images' own.
+    """
+    own = renderer.background
+    color = None if frames.background is None else parse_color(frames.background)
+    if color is not None and not frames.is_transparent and _differs(renderer, color):
+        shown = [round(value, 3) for value in color]
+        print(f"the images are opaque, before {shown}: predictions are put on that, not on {_color_name(renderer)}")
+        renderer.background = ConstantBackground(color).to(renderer.device)
     try:
-        data.check("test")
-    except ValueError as error:
-        print(f"the camera is that of the train split: {error}")
-        return "train"
-    return "test"
+        yield
+    finally:
+        renderer.background = own
+
+
+def _differs(renderer: Renderer, color: tuple[float, float, float]) -> bool:
+    constant = renderer.background.constant()
+    return constant is None or float((constant.cpu() - torch.tensor(color)).abs().max()) > SAME_LEVELS / 255
 
 
 def _color_name(renderer: Renderer) -> str:

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from planning import OVERRIDES, as_decided
 
 from dnerf.core.files import TEMPORARY, claimed, remove_leftovers, write_json, write_text
+from dnerf.data.scene_record import SCENE
 from dnerf.planning.plan import FILE
 from dnerf.training.checkpoint_folder import CHECKPOINTS, CheckpointFolder
 
@@ -36,7 +37,7 @@ CHANGEABLE = (
     "trainer.callbacks.box_warning",
 )
 OWN_FOLDERS = (CHECKPOINTS, "previews")
-FITTED = "auto"  # data.box
+FROM_DATA = "background_from_data"
 
 
 def continued(config: DictConfig) -> DictConfig:
@@ -61,9 +62,11 @@ def continued(config: DictConfig) -> DictConfig:
     if _is_free(folder) and not all(map(_may_change, given)):
         return config
     moved(saved, config.data_root)
-    values = as_decided(config, folder, saved.data.get("box")).copy()
-    if values.data.get("box") == FITTED:  # the run knows which box that is
-        values.data.box = saved.data.get("box", FITTED)
+    values = as_decided(config, folder).copy()
+    # What the run has found in its data: it knows.
+    for name in ("box", *(("background",) if values.get(FROM_DATA) and saved.get(FROM_DATA) else ())):
+        if name in saved:
+            values[name] = saved[name]
     values = resolved(values)
     if given & set(hydra.runtime.choices):  # an experiment or another group was named: all of it must agree
         moved(values, config.data_root)
@@ -157,4 +160,4 @@ def _is_free(folder: Path) -> bool:
     paths = [path for path in folder.iterdir() if not path.name.startswith(TEMPORARY)]
     left = {path.name for path in paths if not path.is_dir() or any(path.iterdir())}
     # A lone config.yaml may be anybody's.
-    return not left or left - {FILE} == {"config.yaml", OVERRIDES}
+    return not left or left - {SCENE, FILE} == {"config.yaml", OVERRIDES}

@@ -4,17 +4,19 @@ Writes the film, a still of its last image, a strip of four of its images, and t
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from hydra_app import build, load_config, load_renderer, moved, resolve_device, run_app
+from hydra_app import load_config, load_renderer, load_scene, resolve_device, run_app
 from omegaconf import DictConfig
-from reporting import camera_split
 from tqdm import tqdm
 
 from dnerf.core.cameras import Camera
 from dnerf.core.checks import check_choice
-from dnerf.data import DataSource
+from dnerf.core.geometry import box_planes
+from dnerf.data import SceneRecord
+from dnerf.data.normalization import IDENTITY
 from dnerf.deformations import Deformation
 from dnerf.deformations.jacobian import folding
 from dnerf.evaluation import spread_indices
@@ -35,34 +37,49 @@ def main(config: DictConfig) -> None:
     output = output if output.suffix else output.with_suffix(suffix)
     if suffix:
         check_film(output, config.format)
-    if not 0 <= config.start <= 1:
+    if config.start is not None and not 0 <= config.start <= 1:
         raise ValueError(f"start must be in [0, 1], got {config.start}")
     saved = load_config(config.run)
-    moved(saved, config.data_root)
+    scene = load_scene(config.run)
     device = resolve_device(config.device)
     renderer = load_renderer(config.run, saved, device)
     model = motion_model(renderer)
     if model is None:
         raise ValueError(f"run: the motion of {config.run} is unknown: its field changes without a deformation")
-    data = build(saved.data)
     chunk = config.chunk or saved.chunk
-    camera = _camera(config, data, device)
-    points = visible_points(renderer, camera, config.start, config.spacing, chunk=chunk)
-    times = torch.linspace(0, 1, config.num_frames).tolist()
+    camera = _camera(config, scene, device)
+    first, last = scene.times
+    start = first if config.start is None else config.start
+    points = visible_points(renderer, camera, start, config.spacing, chunk=chunk)
+    times = torch.linspace(first, last, config.num_frames).tolist()
     tracks, images = render_tracks(
-        renderer, camera, points, config.start, times, trail=config.trail, every=config.every, chunk=chunk
+        renderer, camera, points, start, times, trail=config.trail, every=config.every, chunk=chunk
     )
     frames = list(tqdm(images, total=-(-len(times) // config.every), unit="frame"))
     write_frames(frames, output, config.format, fps=config.fps)
     still = write_png(frames[-1], output.parent / f"{output.stem}_still.png")
     strip = torch.cat([frames[i] for i in spread_indices(len(frames), STRIP)], dim=1)
     write_png(strip, output.parent / f"{output.stem}_strip.png")
-    arrays = {name: getattr(tracks, name).cpu().numpy() for name in ("times", "positions", "residuals")}
-    np.savez_compressed(output.parent / f"{output.stem}.npz", **arrays)
+    np.savez_compressed(output.parent / f"{output.stem}.npz", **_own_units(tracks, scene))
     print(f"{points.shape[0]} tracks over {len(frames)} frames: {output}, {still}")
-    print(f"residual: median {tracks.residuals.median():.2e}, largest {tracks.residuals.max():.2e} world units")
+    scale = scene.world.similarity.scale
+    median, largest = tracks.residuals.median() / scale, tracks.residuals.max() / scale
+    print(f"residual: median {median:.2e}, largest {largest:.2e}, in the data set's units")
     if isinstance(model, Deformation):
         _print_folding(model, tracks)
+
+
+def _own_units(tracks: Tracks, scene: SceneRecord) -> dict[str, Any]:
+    """Arrays of tracks in the data set's own units, and their times by its own clock beside those in [0, 1]."""
+    world = scene.world
+    own = tracks.positions.cpu()
+    if world.similarity != IDENTITY:
+        own = world.similarity.positions_from_world(own)
+    times = tracks.times.cpu().numpy()
+    return {
+        "times": times, "data_times": world.clock.start + times.astype(np.float64) * world.clock.length,
+        "positions": own.numpy(), "residuals": (tracks.residuals.cpu() / world.similarity.scale).numpy(),
+    }  # fmt: skip
 
 
 def _print_folding(deformation: Deformation, tracks: Tracks) -> None:
@@ -74,15 +91,15 @@ def _print_folding(deformation: Deformation, tracks: Tracks) -> None:
     )
 
 
-def _camera(config: DictConfig, data: DataSource, device: torch.device) -> Camera:
-    frames = data.frames(camera_split(config.split, data))
-    if not 0 <= config.frame < len(frames):
-        raise ValueError(f"frame must be in 0..{len(frames) - 1}, got {config.frame}")
-    intrinsics = frames.intrinsics
+def _camera(config: DictConfig, scene: SceneRecord, device: torch.device) -> Camera:
+    _, cameras = scene.split(config.split)
+    if not 0 <= config.frame < len(cameras):
+        raise ValueError(f"frame must be in 0..{len(cameras) - 1}, got {config.frame}")
+    intrinsics, pose = cameras.intrinsics[config.frame], cameras.poses[config.frame]
     if config.resolution is not None:
-        height = round(config.resolution * intrinsics.height / intrinsics.width)
+        height = max(1, round(config.resolution * intrinsics.height / intrinsics.width))
         intrinsics = intrinsics.resized(config.resolution, height)
-    return Camera(intrinsics, frames.poses[config.frame].to(device), frames.near, frames.far)
+    return Camera(intrinsics, pose.to(device), *box_planes(pose[None], scene.world.box)[0])
 
 
 if __name__ == "__main__":

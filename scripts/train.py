@@ -8,15 +8,17 @@ from typing import Any
 import planning
 import torch
 from hydra_app import build, resolve_device, resolved, run_app
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from reporting import evaluate_run, print_scores
-from run_folder import FITTED, continued, opened, save_config
+from run_folder import FROM_DATA, continued, folder_of, opened, save_config
 
+from dnerf.core.backgrounds import ConstantBackground
 from dnerf.core.files import write_json
-from dnerf.data.background_check import background_contradiction
+from dnerf.data.background_check import background_contradiction, data_background
 from dnerf.data.bounds import check_views
 from dnerf.data.frames import Frames
-from dnerf.data.source import DataSource
+from dnerf.data.scene_record import SCENE, SceneRecord, World
+from dnerf.data.source import DataSource, NoImages
 from dnerf.evaluation.provenance import commit, hardware
 from dnerf.planning.plan import FILE
 from dnerf.rendering.renderer import Renderer
@@ -36,11 +38,11 @@ def main(config: DictConfig) -> None:
 def train(config: DictConfig, resume: bool, device: torch.device, processes: Processes, held: ExitStack) -> None:
     """Build data, model and trainer; train; save weights, facts and scores in the run's folder."""
     data = build(config.data, trusted=True)
-    if config.evaluate_split is not None:
-        data.check(config.evaluate_split)
+    unscored = _unscored(config, data)
+    world = processes.from_first(lambda: find_world(config, resume, data))
+    data.settle(world)
     frames = data.frames("train")
-    fitted = config.data.get("box") == FITTED
-    config = in_box(config, data, frames, processes)
+    config, background = suited(config, world, frames)
     folder = processes.from_first(lambda: held.enter_context(opened(config)))
     plan, begun = None, None
     if parts := planning.parts_of(config):
@@ -48,23 +50,27 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
             plan, begun = planning.decide(config, parts, frames, device, folder)
         else:  # the first one decides, and training begins anew
             plan = processes.from_first(lambda: planning.decide(config, parts, frames, device, folder)[0])
-        config = planning.composed(parts, plan.choices, config.data.get("box"), planning.given_overrides(folder))
+        config = planning.as_planned(config, parts, plan.choices, folder)
     # The same seed in every process: they begin with one model.
     torch.manual_seed(config.seed)
     renderer = build(config.renderer, trusted=True).to(device) if begun is None else begun.renderer
     trainer = build(config.trainer, trusted=True)
+    said = background_contradiction(renderer.background.constant(), frames)
     if processes.is_first:
+        if not (resume and (folder / SCENE).exists()):
+            data.record().write(folder)
         if plan is not None:
             plan.save(folder / FILE)
             save_config(folder, config)
             print(plan.table())
-        size = f"{frames.intrinsics.width} x {frames.intrinsics.height}"
+        sizes = {f"{each.width} x {each.height}" for each in frames.intrinsics}
+        size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
         num_parameters = sum(p.numel() for p in renderer.parameters())
         print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {renderer.device}")
-        print(f"box: {config.data.get('box')}, {'fitted to the frames' if fitted else 'as given'}")
-        color = renderer.background.constant()
-        if color is not None and (said := background_contradiction(color, frames)):
-            print(f"warning: {said}")
+        for note in (*world.notes, *background, *unscored):
+            print(note)
+        for warning in (*world.warnings, *([said] if said else [])):
+            print(f"warning: {warning}")
     record = trainer.fit(
         renderer, frames, seed=config.seed, folder=folder, resume=resume, processes=processes, begun=begun
     )
@@ -72,20 +78,41 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
         finish(config, resume, folder, renderer, data, record)
 
 
-def in_box(config: DictConfig, data: DataSource, frames: Frames, processes: Processes) -> DictConfig:
-    """The resolved config, `data.box` being the corners that the first process finds in its frames, or was given.
+def _unscored(config: DictConfig, data: DataSource) -> list[str]:
+    """Check the split that will be scored; where the data set has no images of it, say so and score none."""
+    if config.evaluate_split is None:
+        return []
+    try:
+        data.check(config.evaluate_split)
+    except NoImages as error:
+        config.evaluate_split = None
+        return [f"nothing will be scored: {error}"]
+    return []
+
+
+def find_world(config: DictConfig, resume: bool, data: DataSource) -> World:
+    """The world of the run that is continued, or of its data set."""
+    if resume and (folder_of(config) / SCENE).exists():
+        return SceneRecord.read(folder_of(config)).world
+    return data.world()
+
+
+def suited(config: DictConfig, world: World, frames: Frames) -> tuple[DictConfig, list[str]]:
+    """The resolved config with the data's box and, if it follows the data, background; and what to say of the latter.
 
     Raises:
         ValueError: if no camera sees into the box.
     """
-    if "box" in config.data:
-        corners = processes.from_first(lambda: data.fitted_box(frames))
-        if config.data.box == FITTED:
-            config.data.box = corners
-    config = resolved(config)
-    if "box" in config.data:
-        check_views(frames, torch.tensor(OmegaConf.to_container(config.data.box)))
-    return config
+    said = []
+    if config.get(FROM_DATA):
+        color, why = data_background(frames)
+        said = [f"background: {why}"]
+        if color is not None:
+            target = f"{ConstantBackground.__module__}.{ConstantBackground.__name__}"
+            config.background = {"_target_": target, "color": color}
+    config.box = [list(corner) for corner in world.box]
+    check_views(frames, torch.tensor(world.box), world.similarity)
+    return resolved(config), said
 
 
 def finish(

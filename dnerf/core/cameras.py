@@ -1,15 +1,16 @@
-"""Pinhole cameras and their rays. Poses are camera-to-world with OpenGL axes."""
+"""Cameras and their rays. Poses are camera-to-world with OpenGL axes."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from dnerf.core.checks import check_choice, check_positive, check_shape
 from dnerf.core.geometry import check_last_axis
-from dnerf.core.lenses import Distortion
+from dnerf.core.lenses import Distortion, Region, examine, project_beyond, undistort
 from dnerf.core.rays import Rays
 
 PIXEL_OFFSETS = {"center": 0.5, "corner": 0.0}
@@ -17,12 +18,13 @@ PIXEL_OFFSETS = {"center": 0.5, "corner": 0.0}
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera without a pose, all lengths in pixels.
+    """A camera without a pose, all lengths in pixels.
 
     Rays go through pixel centres (+0.5); through their upper left corners, as in D-NeRF's code, with "corner".
 
     Raises:
-        ValueError: for sizes or focal lengths that are not positive, or an unknown pixel origin.
+        ValueError: for sizes or focal lengths that are not positive, a principal point that is not finite, an unknown
+            pixel origin, or a lens that folds over inside the image, see `examine`.
     """
 
     width: int
@@ -38,6 +40,12 @@ class Intrinsics:
         for name in ("width", "height", "focal_x", "focal_y"):
             check_positive(name, getattr(self, name))
         check_choice("pixel_origin", self.pixel_origin, tuple(PIXEL_OFFSETS))
+        for name in ("center_x", "center_y"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} must be finite or None, got {value}")
+        if self.distortion is not None:
+            self.region()
 
     @classmethod
     def from_angle(cls, width: int, height: int, angle_x: float, pixel_origin: str = "center") -> "Intrinsics":
@@ -57,28 +65,64 @@ class Intrinsics:
         )  # fmt: skip
 
     @property
-    def lens(self) -> tuple[float, float, float, float]:
+    def center(self) -> tuple[float, float]:
+        """The principal point, from the left and from the top edge."""
+        return (
+            0.5 * self.width if self.center_x is None else self.center_x,
+            0.5 * self.height if self.center_y is None else self.center_y,
+        )
+
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
         """Focal lengths along x and y, principal column and row; the rays of pixels go through whole numbers."""
         offset = PIXEL_OFFSETS[self.pixel_origin]
-        center_x = 0.5 * self.width if self.center_x is None else self.center_x
-        center_y = 0.5 * self.height if self.center_y is None else self.center_y
+        center_x, center_y = self.center
         return self.focal_x, self.focal_y, center_x - offset, center_y - offset
 
+    def region(self) -> Region:
+        """What is known of the distortion inside the image; there must be one."""
+        assert self.distortion is not None
+        center_x, center_y = self.center
+        return examine(
+            self.distortion, -center_x / self.focal_x, (self.width - center_x) / self.focal_x,
+            -center_y / self.focal_y, (self.height - center_y) / self.focal_y,
+        )  # fmt: skip
+
     def pixel_directions(self, columns: Tensor, rows: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Directions in camera space with z = -1: (...,) integer pixels -> (..., 3)."""
-        focal_x, focal_y, column, row = self.lens
+        """Directions in camera space with z = -1: (...,) columns and rows, whole for pixels -> (..., 3)."""
+        focal_x, focal_y, column, row = self.pinhole
+        if self.distortion is not None:
+            x, y = (columns.double() - column) / focal_x, (rows.double() - row) / focal_y
+            x, y = undistort(self.distortion.model, self.distortion.coefficients, x, y, self.region())
+            return torch.stack([x, -y, -torch.ones_like(x)], dim=-1).to(dtype)
         x = (columns.to(dtype) - column) / focal_x
         y = (row - rows.to(dtype)) / focal_y
         return torch.stack([x, y, -torch.ones_like(x)], dim=-1)
 
+    def seen_at(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Column and row (...) where positions in the plane at depth 1, x right and y up, are seen."""
+        focal_x, focal_y, column, row = self.pinhole
+        if self.distortion is not None:
+            model, coefficients = self.distortion.model, self.distortion.coefficients
+            u, v = project_beyond(model, coefficients, self.region().radius, x.double(), -y.double())
+            return (u * focal_x + column).to(x.dtype), (v * focal_y + row).to(x.dtype)
+        return x * focal_x + column, row - y * focal_y
+
+
+class PixelDirections(Protocol):
+    """What rays need to know of cameras: `Intrinsics`, or those of each ray (`RayIntrinsics`)."""
+
+    def pixel_directions(self, columns: Tensor, rows: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Directions in camera space with z = -1, (R, 3)."""
+
 
 def camera_rays(
-    intrinsics: Intrinsics, poses: Tensor, columns: Tensor, rows: Tensor, *, times: Tensor, near: float, far: float
+    intrinsics: PixelDirections, poses: Tensor, columns: Tensor, rows: Tensor, *, times: Tensor, near: float, far: float
 ) -> Rays:
     """Rays through pixels, each of its own camera and time.
 
     Args:
-        intrinsics: shared by all.
+        intrinsics: shared by all, or those of each.
         poses: (R, 4, 4) or (4, 4), camera-to-world.
         columns: (R,) pixel columns.
         rows: (R,) pixel rows.
@@ -99,7 +143,7 @@ def camera_rays(
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with a pose and clipping planes; ValueError for another shape or not 0 <= near < far."""
+    """A camera with a pose and clipping planes; ValueError for another shape or not 0 <= near < far."""
 
     intrinsics: Intrinsics
     pose: Tensor  # (4, 4) camera-to-world, OpenGL axes
@@ -116,7 +160,7 @@ class Camera:
 
         Returns:
             pixels: (..., 2) column and row; whole numbers are where the rays of pixels go. Not finite in the plane of
-                the camera, mirrored behind it.
+                the camera, mirrored behind it. Beyond what the image holds, distortion goes on straight outwards.
             depth: (...,) z-depth in world units, negative behind the camera.
         """
         check_last_axis("positions", positions, 3)
@@ -124,8 +168,7 @@ class Camera:
         offsets = (positions - pose[:3, 3]).unbind(-1)
         x, y, z = (_product(offsets, pose[:3, axis]) for axis in range(3))
         depth = -z
-        focal_x, focal_y, column, row = self.intrinsics.lens
-        return torch.stack([x / depth * focal_x + column, row - y / depth * focal_y], dim=-1), depth
+        return torch.stack(self.intrinsics.seen_at(x / depth, y / depth), dim=-1), depth
 
     def rays(self, time: float, pixels: Tensor | None = None) -> Rays:
         """Rays at a time in [0, 1] of pixels (P,) int64, `row * width + column`; None for all, in this order."""

@@ -1,9 +1,14 @@
 """Rays against boxes, rotations and rigid motions, each safe in value and gradient at its bad point."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from dnerf.core.checks import check_shape
+from dnerf.core.checks import as_box, check_shape
+
+# Least distance of planes, in world units: a box behind the camera leaves an empty film, not an error.
+MIN_DEPTH = 1e-3
 
 
 def ray_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,3 +143,17 @@ def check_last_axis(name: str, value: Tensor, size: int) -> None:
 def cube_corners(device: torch.device) -> Tensor:
     """The corners (8, 3) of the unit cube, int64, z fastest."""
     return torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
+
+
+def box_planes(poses: Tensor, box: Sequence[Sequence[float]] | Tensor) -> list[tuple[float, float]]:
+    """Near and far z-depths between which cameras (F, 4, 4) have a whole box (2, 3): F pairs 0 <= near < far.
+
+    Planes follow from where a camera is. Near is 0 where the camera is within the box's depths.
+    """
+    check_shape("poses", poses, ("F", 4, 4))
+    corners = as_box(box).to(poses)
+    places = torch.lerp(corners[0], corners[1], cube_corners(poses.device).to(poses.dtype))
+    offsets = places - poses[:, None, :3, 3]
+    depths = -(offsets * poses[:, None, :3, 2]).sum(-1)
+    nearest, farthest = depths.amin(-1).clamp(min=0).tolist(), depths.amax(-1).clamp(min=MIN_DEPTH).tolist()
+    return list(zip(nearest, farthest))

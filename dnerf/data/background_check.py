@@ -10,32 +10,67 @@ MAX_FRAMES = 32  # whose borders are looked at, evenly spread
 SAME_LEVELS = 8  # of 255: what JPEG and shading leave of one colour
 
 
-def background_contradiction(color: Tensor, frames: Frames) -> str | None:
-    """What the training images say against a background color (3,) in [0, 1], as a sentence for a warning, or None.
+def data_background(frames: Frames) -> tuple[list[float] | None, str]:
+    """The colour behind training frames that a model should have, and why; None if they go with any.
 
-    Images that are transparent somewhere go with any background. Of opaque ones the file may state it; if it does not,
-    most pixels at their borders may have one colour.
+    Images that are transparent somewhere do. Of opaque ones the file may state it, or most pixels at their borders have
+    one colour; where they show something everywhere, it hardly matters.
     """
     if frames.is_transparent:
-        return None
-    other: Tensor | None
+        return None, "random in training, since the images have alpha"
     if frames.background is not None:
-        says, other = "the data set states", torch.tensor(parse_color(frames.background))
-    else:
-        says, other = "most pixels at the images' borders are", border_color(frames)
-    if other is None or float((color.detach().float().cpu() - other).abs().max()) <= SAME_LEVELS / 255:
+        color = list(parse_color(frames.background))
+        return color, f"{_rounded(torch.tensor(color))}, as the data set states"
+    border = border_color(frames)
+    if border is not None:
+        return border.tolist(), f"{_rounded(border)}, which most pixels at the images' borders are"
+    return [0.0, 0.0, 0.0], "black: the images are opaque and show something everywhere"
+
+
+def background_contradiction(color: Tensor | None, frames: Frames) -> str | None:
+    """What opaque training images say against a background color (3,) in [0, 1], as a sentence for a warning, or None.
+
+    Raises:
+        ValueError: if the data set states another colour.
+    """
+    if color is None or frames.is_transparent:
+        return None
+    if frames.background is not None:
+        stated = torch.tensor(parse_color(frames.background))
+        if not _differ(color, stated):
+            return None
+        shown = _rounded(stated)
+        raise ValueError(
+            f"background must be {shown} as the data set states, got {_rounded(color)}: the model would explain the "
+            "difference by density in empty space; leave background=auto, or set background=white "
+            f"background.color={str(shown).replace(' ', '')}"
+        )
+    border = border_color(frames)
+    if border is None or not _differ(color, border):
         return None
     return (
-        f"background is {_rounded(color)}, but {says} {_rounded(other)}: the model would explain the difference by "
-        "density in empty space; set background.color"
+        f"background is {_rounded(color)}, but most pixels at the images' borders are {_rounded(border)}: the model "
+        "would explain the difference by density in empty space; leave background=auto, or set background.color"
     )
+
+
+def _differ(color: Tensor, other: Tensor) -> bool:
+    return float((color.detach().float().cpu() - other).abs().max()) > SAME_LEVELS / 255
+
+
+def background_color(frames: Frames) -> Tensor | None:
+    """The colour (3,) in [0, 1] behind opaque images: as the data set states, else as their borders show; else None."""
+    return border_color(frames) if frames.background is None else torch.tensor(parse_color(frames.background))
 
 
 def border_color(frames: Frames) -> Tensor | None:
     """The colour (3,) in [0, 1] that most pixels at the borders of opaque images have; None if there is none."""
     chosen = torch.linspace(0, len(frames) - 1, min(len(frames), MAX_FRAMES)).round().long()
-    images = frames.images[chosen.to(frames.images.device)][..., :3].cpu()
-    border = torch.cat([images[:, [0, -1]].flatten(0, 2), images[:, :, [0, -1]].flatten(0, 2)]).float()
+    parts = []
+    for index in chosen.tolist():
+        image = frames.stored_image(index)[..., :3]
+        parts += [image[[0, -1]].flatten(0, 1).cpu(), image[:, [0, -1]].flatten(0, 1).cpu()]
+    border = torch.cat(parts).float()
     color = border.median(0).values
     share = ((border - color).abs().amax(-1) <= SAME_LEVELS).float().mean()
     return color / 255 if share > 0.5 else None

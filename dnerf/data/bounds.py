@@ -6,9 +6,10 @@ from torch.nn.functional import max_pool3d
 
 from dnerf.core.checks import check_shape
 from dnerf.core.geometry import ray_box
-from dnerf.data.background_check import border_color
-from dnerf.data.carving import EVERY_PIXEL, Silhouettes, carve, hold_opaque
+from dnerf.data.background_check import background_color
+from dnerf.data.carving import EVERY_PIXEL, Silhouettes, carve, hold_opaque, opaque_rays
 from dnerf.data.frames import Frames
+from dnerf.data.normalization import IDENTITY, Similarity
 from dnerf.samplers import OccupiedCells
 
 ROOM = 0.03  # at each face, of the longest side: surfaces are softer in training than they are
@@ -32,15 +33,15 @@ def fit_box(frames: Frames, points: Tensor | None = None) -> Tensor:
     - Images with alpha: what their opaque pixels can show (`carve`), with room around it. No opaque pixel looks past
       the box.
     - Otherwise sparse points, if there are any: what holds nearly all of them, with more room.
-    - Otherwise what enough cameras see between their planes: half of them if the images' borders have one colour, so
-      that the scene is in the middle, a tenth of them if the images show something everywhere.
+    - Otherwise, if one colour is behind the scene, the same as with alpha, of the pixels that have another one.
+    - Otherwise what a tenth of the cameras see between their planes: the images show something everywhere.
 
     Args:
         points: (N, 3) on surfaces, for example of structure from motion, in world units; None if there are none.
             ValueError for another shape, or if none is finite.
     """
     if frames.is_transparent:
-        return _with_room(hold_opaque(frames, _carved(frames)), ROOM)
+        return _with_room(hold_opaque(frames, _carved(frames, None)), ROOM)
     if points is not None:
         check_shape("points", points, ("N", 3))
         points = points[points.isfinite().all(-1)]
@@ -48,12 +49,15 @@ def fit_box(frames: Frames, points: Tensor | None = None) -> Tensor:
             raise ValueError("points must hold a finite one, got none")
         ends = torch.tensor([QUANTILE, 1 - QUANTILE], dtype=points.dtype, device=points.device)
         return _with_room(torch.quantile(points, ends, dim=0), ROOM_AROUND_POINTS)
-    return seen_box(frames, SHARES[0] if border_color(frames) is not None else SHARES[1])
+    behind = background_color(frames)
+    if behind is not None:
+        return _with_room(hold_opaque(frames, _carved(frames, behind), behind), ROOM)
+    return seen_box(frames, SHARES[1])
 
 
-def _carved(frames: Frames) -> Tensor:
+def _carved(frames: Frames, behind: Tensor | None) -> Tensor:
     """What opaque pixels can show, within what enough cameras see."""
-    silhouettes = Silhouettes.of(frames)
+    silhouettes = Silhouettes.of(frames, behind)
     for share in SHARES:
         box = seen_box(frames, share)
         while (smaller := carve(silhouettes, box)) is not None:
@@ -77,13 +81,12 @@ def seen_box(frames: Frames, share: float) -> Tensor:
 
     The share is of the cameras that see the place which most of them see; 0 for what any sees.
     """
-    width, height = frames.intrinsics.width, frames.intrinsics.height
-    rows, columns = (torch.linspace(0, size - 1, 4, device=frames.poses.device).round() for size in (height, width))
-    pixels = (width * rows[:, None] + columns).reshape(-1).long()
+    steps = torch.linspace(0, 1, 32, device=frames.poses.device)
     positions = []
     for index in _evenly(len(frames), MAX_VIEWS):
-        rays = frames.camera(index).rays(0.0, pixels)
-        steps = torch.linspace(0, 1, 32, device=pixels.device)
+        height, width = frames.layout.sizes[index]
+        rows, columns = (torch.linspace(0, size - 1, 4, device=steps.device).round() for size in (height, width))
+        rays = frames.camera(index).rays(0.0, (width * rows[:, None] + columns).reshape(-1).long())
         begin = rays.near.maximum(1e-3 * rays.far)[:, None]  # a logarithm needs one
         distances = begin * (rays.far[:, None] / begin) ** steps
         positions.append((rays.origins[:, None] + distances[..., None] * rays.directions[:, None]).flatten(0, 1))
@@ -96,10 +99,10 @@ def seen_box(frames: Frames, share: float) -> Tensor:
 
 def share_of_views(frames: Frames, positions: Tensor) -> Tensor:
     """The share (N,) of views between whose planes, and within whose image, positions (N, 3) in world units lie."""
-    width, height = frames.intrinsics.width, frames.intrinsics.height
     chosen = _evenly(len(frames), LOOKED_AT)
     seen = torch.zeros(len(positions), device=positions.device)
     for index in chosen:
+        height, width = frames.layout.sizes[index]
         pixels, depth = frames.camera(index).project(positions)
         x, y = pixels.unbind(-1)
         is_between = (frames.near <= depth) & (depth <= frames.far)
@@ -111,26 +114,39 @@ def _evenly(count: int, most: int) -> list[int]:
     return torch.linspace(0, count - 1, min(count, most)).round().long().tolist()
 
 
-def check_views(frames: Frames, box: Tensor) -> None:
+def check_views(frames: Frames, box: Tensor, similarity: Similarity = IDENTITY) -> None:
     """Raise unless some pixel's ray is in the box (2, 3) between the planes: otherwise there is nothing to learn from.
 
     One of `EVERY_PIXEL` squared pixels of each view is looked at. The ValueError names the box, the planes and where
-    the cameras' rays are between them.
+    the cameras' rays are between them, in the data set's own units.
     """
     box = box.to(frames.poses.device)
-    width, height = frames.intrinsics.width, frames.intrinsics.height
-    rows, columns = (torch.arange(0, size, EVERY_PIXEL, device=box.device) for size in (height, width))
-    pixels = (width * rows[:, None] + columns).reshape(-1)
-    for index in range(len(frames)):
-        rays = frames.camera(index).rays(0.0, pixels)
+    for index, (height, width) in enumerate(frames.layout.sizes):
+        rows, columns = (torch.arange(0, size, EVERY_PIXEL, device=box.device) for size in (height, width))
+        rays = frames.camera(index).rays(0.0, (width * rows[:, None] + columns).reshape(-1))
         enter, leave = ray_box(rays.origins, rays.directions, box)
         if bool((enter.maximum(rays.near) < leave.minimum(rays.far)).any()):
             return
+    near, far = frames.near / similarity.scale, frames.far / similarity.scale
+    own, seen = (similarity.box_from_world(corners).float().tolist() for corners in (box, seen_box(frames, 0)))
     raise ValueError(
-        f"box must be seen by some camera between near {frames.near:g} and far {frames.far:g}, got {box.tolist()}; "
-        f"what cameras see there lies within {seen_box(frames, 0).tolist()}: other units, or another data.box, "
-        "data.near or data.far, are meant"
+        f"box must be seen by some camera between near {near:g} and far {far:g}, got {own}; what cameras see there "
+        f"lies within {seen}: other units, or another data.box, data.near or data.far, are meant"
     )
+
+
+def opaque_without_room(frames: Frames, box: Tensor) -> float:
+    """The share of opaque pixels whose rays miss the box (2, 3) between the planes: nothing can explain them.
+
+    Images have alpha. One of `EVERY_PIXEL` squared pixels of each view is looked at.
+    """
+    count = missed = 0
+    for index in range(len(frames)):
+        rays = opaque_rays(frames, index)
+        enter, leave = ray_box(rays.origins, rays.directions, box.to(rays.origins))
+        missed += int((enter.maximum(rays.near) >= leave.minimum(rays.far)).sum())
+        count += len(rays)
+    return missed / max(count, 1)
 
 
 def cut_faces(cells: OccupiedCells, frames: Frames, min_views: float = MIN_VIEWS) -> list[str]:

@@ -1,4 +1,4 @@
-"""Space carving: what images with alpha can show lies where views near in time are opaque.
+"""Space carving: what images with alpha, or before one colour, can show lies where views near in time are opaque.
 
 The scene moves and most data sets have one view of each time, so views of other times carve, too. On the ray of an
 opaque pixel, each position has its *support*: how many consecutive views, its own among them, have it in an opaque
@@ -13,12 +13,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from dnerf.core.cameras import Intrinsics, camera_rays
+from dnerf.core.cameras import camera_rays
+from dnerf.core.frame_intrinsics import FrameIntrinsics
 from dnerf.core.geometry import ray_box
 from dnerf.core.rays import Rays
 from dnerf.data.frames import Frames
 
-OPAQUE = 26  # alpha, of 255, from which a pixel shows something: a tenth, so that the rims of fog count
+# Alpha, or difference from the colour behind, of 255, from which a pixel shows something: a tenth, so that the rims of
+# fog count.
+OPAQUE = 26
 NUM_BLOCKS = 100  # of pixels along an image's longer side, each opaque if one of its pixels is
 MAX_RAYS = 12_000  # of outlines, evenly spread over all views: half a second on one core
 NUM_DISTANCES = 48  # along each
@@ -35,31 +38,39 @@ EVERY_PIXEL = 3  # in rows and columns, of those that are looked at one by one
 class Silhouettes:
     """Opaque blocks of pixels of all views in order of time."""
 
-    intrinsics: Intrinsics  # of all views
+    intrinsics: FrameIntrinsics
     planes: tuple[float, float]  # z-depths where rays begin and end
     poses: Tensor  # (F, 4, 4) camera-to-world
     times: Tensor  # (F,) times as whole numbers: how many different ones come before
     block: int  # pixels along a block's sides
     # (F, H, W) uint8, how many blocks away the nearest opaque one is, by rows or columns, whichever is more; 255 beyond
-    # `MAX_DISTANCE`.
+    # `MAX_DISTANCE`. Smaller views lie in the upper left corner.
     distances: Tensor
 
     @classmethod
-    def of(cls, frames: Frames, least: int = OPAQUE) -> "Silhouettes":
-        """The silhouettes of frames with alpha: pixels of at least so much, of 255."""
-        block = -(-max(frames.images.shape[1:3]) // NUM_BLOCKS)
+    def of(cls, frames: Frames, behind: Tensor | None = None, *, least: int = OPAQUE) -> "Silhouettes":
+        """The silhouettes, of at least so much alpha of 255, of frames with alpha or before a colour (3,) in [0, 1]."""
+        block = -(-max(max(size) for size in frames.layout.sizes) // NUM_BLOCKS)
         order = frames.times.argsort(stable=True)
-        blocks = [max_pool2d(frames.images[i, None, ..., 3].float(), block, ceil_mode=True) for i in order.tolist()]
+        rows = order.tolist()
+        blocks = [max_pool2d(shown(frames, i, behind)[None], block, ceil_mode=True) for i in rows]
+        sizes = [each.shape[1:] for each in blocks]
+        height, width = (max(size[axis] for size in sizes) for axis in (0, 1))
+        blocks = [pad(each, (0, width - each.shape[2], 0, height - each.shape[1])) for each in blocks]
         opaque = torch.cat(blocks) >= least
         distances = torch.where(opaque, 0, 255).to(torch.uint8)
         for distance in range(1, MAX_DISTANCE + 1):
             opaque = _dilated(opaque)
             distances.masked_fill_(opaque & (distances == 255), distance)
+        for view, (rows_in, columns_in) in zip(distances, sizes):
+            view[rows_in:], view[:, columns_in:] = 255, 255
         times = frames.times[order].unique(return_inverse=True)[1]
-        return cls(frames.intrinsics, (frames.near, frames.far), frames.poses[order], times, block, distances)
+        intrinsics = FrameIntrinsics([frames.intrinsics[i] for i in rows], order.device)
+        return cls(intrinsics, (frames.near, frames.far), frames.poses[order], times, block, distances)
 
     def outlines(self) -> tuple[Tensor, Rays]:
         """Views (R,) and rays of opaque blocks beside clear ones or at the border: what is opaque ends on such rays."""
+        # The border is clear, and so is what lies beyond a smaller view.
         clear = _dilated(pad(self.distances > 0, (1, 1, 1, 1), value=True))[:, 1:-1, 1:-1]
         views, rows, columns = ((self.distances == 0) & clear).nonzero().unbind(-1)
         kept = slice(None, None, max(1, -(-len(views) // MAX_RAYS)))
@@ -67,7 +78,8 @@ class Silhouettes:
         near, far = self.planes
         columns, rows = ((index + 0.5) * self.block - 0.5 for index in (columns, rows))
         times = torch.zeros(len(views), device=views.device)
-        return views, camera_rays(self.intrinsics, self.poses[views], columns, rows, times=times, near=near, far=far)
+        lenses = self.intrinsics.of(views)
+        return views, camera_rays(lenses, self.poses[views], columns, rows, times=times, near=near, far=far)
 
     def support(self, views: Tensor, rays: Rays, distances: Tensor, motion: float) -> Tensor:
         """How many consecutive views have positions on rays in opaque pixels, the rays' own among them: (R, D) int64.
@@ -112,9 +124,8 @@ class Silhouettes:
         start = (rotation * (rays.origins - position)[:, :, None]).sum(1)
         along = (rotation * rays.directions[:, :, None]).sum(1)
         x, y, z = (start[index] + distances[:, None] * along[index]).unbind(-1)
-        focal_x, focal_y, column, row = self.intrinsics.lens
-        columns = ((column - x / z * focal_x + 0.5) / self.block).floor()
-        rows = ((row + y / z * focal_y + 0.5) / self.block).floor()
+        lenses = self.intrinsics.shared or self.intrinsics.of(others[index])
+        columns, rows = (((place + 0.5) / self.block).floor() for place in lenses.seen_at(x / -z, y / -z))
         height, width = self.distances.shape[1:]
         near, far = self.planes
         is_seen = (-z >= near) & (-z <= far) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
@@ -146,19 +157,19 @@ def carve(silhouettes: Silhouettes, box: Tensor) -> Tensor | None:
     chosen = distances[index, step]
     positions = rays.origins[index] + chosen[:, None] * rays.directions[index]
     spacing = (leave / enter).log()[index] / NUM_DISTANCES
-    room = 0.5 * chosen * spacing.clamp(min=silhouettes.block / silhouettes.intrinsics.focal_x)
+    blocks = torch.tensor([silhouettes.block / lens.focal_x for lens in silhouettes.intrinsics.each], device=box.device)
+    room = 0.5 * chosen * spacing.maximum(blocks[views[index]])
     return torch.stack([(positions - room[:, None]).amin(0), (positions + room[:, None]).amax(0)])
 
 
-def hold_opaque(frames: Frames, box: Tensor) -> Tensor:
+def hold_opaque(frames: Frames, box: Tensor, behind: Tensor | None = None) -> Tensor:
     """A box (2, 3), grown until no opaque pixel looks past it: to the position on its ray that is nearest to the box.
 
     One of `EVERY_PIXEL` squared pixels of each view is looked at.
     """
     steps = torch.linspace(0, 1, NUM_DISTANCES, device=box.device)
     for index in range(len(frames)):
-        rows, columns = (frames.images[index, ::EVERY_PIXEL, ::EVERY_PIXEL, 3] >= OPAQUE).nonzero().unbind(-1)
-        rays = frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * frames.intrinsics.width + columns))
+        rays = opaque_rays(frames, index, behind)
         enter, leave = ray_box(rays.origins, rays.directions, box)
         past = rays[((enter > leave) | (leave < rays.near) | (enter > rays.far)).nonzero()[:, 0]]
         distances = past.near[:, None] + (past.far - past.near)[:, None] * steps
@@ -167,6 +178,20 @@ def hold_opaque(frames: Frames, box: Tensor) -> Tensor:
         nearest = positions[torch.arange(len(past), device=box.device), outside.argmin(-1)]
         box = torch.stack([torch.cat([box[:1], nearest]).amin(0), torch.cat([box[1:], nearest]).amax(0)])
     return box
+
+
+def opaque_rays(frames: Frames, index: int, behind: Tensor | None = None) -> Rays:
+    """The rays of one in `EVERY_PIXEL` squared opaque pixels of a frame."""
+    levels = shown(frames, index, behind)
+    rows, columns = (levels[::EVERY_PIXEL, ::EVERY_PIXEL] >= OPAQUE).nonzero().unbind(-1)
+    return frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * levels.shape[1] + columns))
+
+
+def shown(frames: Frames, index: int, behind: Tensor | None) -> Tensor:
+    """How much of something each pixel shows, (H, W) float32 in [0, 255]: its alpha, or with a colour (3,) in [0, 1]
+    behind opaque images, the largest difference from it. What has that colour itself needs no density."""
+    image = frames.stored_image(index).float()
+    return image[..., 3] if behind is None else (image[..., :3] - 255 * behind.to(image)).abs().amax(-1)
 
 
 def _dilated(blocks: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""Images of a moving scene held as uint8, each with its camera pose and time."""
+"""Images of a moving scene held as uint8, each with its camera and time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -9,7 +9,10 @@ from torch import Tensor
 from dnerf.core.backgrounds import parse_color
 from dnerf.core.cameras import Camera, Intrinsics, camera_rays
 from dnerf.core.checks import check_shape
+from dnerf.core.frame_intrinsics import FrameIntrinsics
 from dnerf.core.rays import Rays
+from dnerf.data.pixel_layout import PixelLayout
+from dnerf.data.pixel_store import empty_pixels
 
 RIGID_TOLERANCE = 1e-3
 
@@ -35,35 +38,66 @@ def is_rigid(poses: Tensor) -> Tensor:
     return proper & (last_row.amax(-1) <= RIGID_TOLERANCE) & poses.isfinite().all(-1).all(-1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Frames:
-    """F images of one scene, each with a camera-to-world pose and a time; all share one pinhole camera.
+    """F images of one scene, each with a camera-to-world pose, intrinsics and a time.
 
     With four channels the colour is **premultiplied** by alpha, rounded once to 8 bits, so that an image on
     background b is `images[..., :3] / 255 + (1 - images[..., 3] / 255) b`. Memory is that of `images`: 200 frames
     of 400 x 400 with alpha take 128 MB.
 
+    Args:
+        intrinsics: of all frames, or F of them.
+
     Raises:
         ValueError: if shapes or types do not fit, a pose is not rigid or a time lies outside [0, 1].
     """
 
-    images: Tensor  # (F, H, W, C) uint8, C = 3 (opaque) or 4 (premultiplied alpha)
+    images: Tensor  # (F, H, W, C) uint8, C = 3 (opaque) or 4 (premultiplied alpha); (P, C) in a row if sizes differ
     poses: Tensor  # (F, 4, 4) float32, camera-to-world, rigid, OpenGL axes
     times: Tensor  # (F,) float32 in [0, 1]
-    intrinsics: Intrinsics  # camera with width W and height H
-    near: float = 2.0  # z-depth where rays begin, in world units
-    far: float = 6.0  # z-depth where rays end
-    background: str | Sequence[float] | None = None  # name or 3 numbers behind opaque images (C = 3); None if unknown
-    names: tuple[str, ...] = ()  # F names for messages and files, or none
+    intrinsics: tuple[Intrinsics, ...]  # one per frame, with its width and height; equal ones are stored once
+    near: float  # z-depth where rays begin, in world units
+    far: float  # z-depth where rays end
+    background: str | Sequence[float] | None  # name or 3 numbers behind opaque images (C = 3); None if unknown
+    names: tuple[str, ...]  # F names for messages and files, or none
+    layout: PixelLayout = field(init=False, repr=False)
+    _lenses: FrameIntrinsics = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        size = (self.intrinsics.height, self.intrinsics.width)
-        check_shape("images", self.images, ("F", *size, "3 or 4"))
-        num_frames, channels = self.images.shape[0], self.images.shape[-1]
-        if num_frames == 0 or channels not in (3, 4):
-            raise ValueError(f"images must have shape (F > 0, H, W, 3 or 4), got {tuple(self.images.shape)}")
+    def __init__(
+        self,
+        images: Tensor,
+        poses: Tensor,
+        times: Tensor,
+        intrinsics: Intrinsics | Sequence[Intrinsics],
+        near: float = 2.0,
+        far: float = 6.0,
+        background: str | Sequence[float] | None = None,
+        names: tuple[str, ...] = (),
+    ) -> None:
+        check_shape("times", times, ("F",))
+        if not len(times):
+            raise ValueError("images must be of at least one frame, got none")
+        each = [intrinsics] * len(times) if isinstance(intrinsics, Intrinsics) else list(intrinsics)
+        if len(each) != len(times):
+            raise ValueError(f"intrinsics must be one, or {len(times)} as there are times, got {len(each)}")
+        lenses = FrameIntrinsics(each, images.device)
+        values = {
+            "images": images, "poses": poses, "times": times, "intrinsics": lenses.each, "near": near, "far": far,
+            "background": background, "names": names, "_lenses": lenses,
+            "layout": PixelLayout([(lens.height, lens.width) for lens in lenses.each], images.device),
+        }  # fmt: skip
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        self._check()
+
+    def _check(self) -> None:
+        num_frames, shared = len(self), self.layout.shared
+        shape = (self.num_pixels, "3 or 4") if shared is None else (num_frames, *shared, "3 or 4")
+        check_shape("images", self.images, shape)
+        if (channels := self.images.shape[-1]) not in (3, 4):
+            raise ValueError(f"images must have shape (..., 3 or 4), got {tuple(self.images.shape)}")
         check_shape("poses", self.poses, (num_frames, 4, 4))
-        check_shape("times", self.times, (num_frames,))
         for name, dtype in (("images", torch.uint8), ("poses", torch.float32), ("times", torch.float32)):
             if getattr(self, name).dtype != dtype:
                 raise ValueError(f"{name} must be {dtype}, got {getattr(self, name).dtype}")
@@ -84,7 +118,7 @@ class Frames:
         self.camera(0)  # checks the planes
 
     def __len__(self) -> int:
-        return self.images.shape[0]
+        return len(self.intrinsics)
 
     @property
     def has_alpha(self) -> bool:
@@ -94,16 +128,28 @@ class Frames:
     @property
     def num_pixels(self) -> int:
         """Number of pixels of all frames together; `pixels` takes indices below it."""
-        return self.images.shape[0] * self.images.shape[1] * self.images.shape[2]
+        return self.layout.num_pixels
+
+    @property
+    def shared_intrinsics(self) -> Intrinsics | None:
+        """The intrinsics of all frames; None if they differ."""
+        return self._lenses.shared
 
     def camera(self, index: int) -> Camera:
         """The camera of one frame."""
-        return Camera(self.intrinsics, self.poses[index], self.near, self.far)
+        return Camera(self.intrinsics[index], self.poses[index], self.near, self.far)
 
     @property
     def is_transparent(self) -> bool:
         """Whether any pixel is not opaque; an alpha channel that is 255 everywhere says nothing of what lies behind."""
-        return self.has_alpha and bool((self.images[..., 3] < 255).any())
+        return self.has_alpha and any(bool((self.stored_image(i)[..., 3] < 255).any()) for i in range(len(self)))
+
+    def stored_image(self, index: int) -> Tensor:
+        """One image as it is stored, (H, W, 3 or 4) uint8; a view."""
+        if self.layout.shared is not None:
+            return self.images[index]
+        start, (height, width) = self.layout.starts[:-1][index], self.layout.sizes[index]
+        return self.images[start : start + height * width].view(height, width, -1)
 
     def image(self, index: int, background: Sequence[float] | Tensor | None = None) -> Tensor:
         """One image on a background, (H, W, 3) float32 in [0, 1].
@@ -111,7 +157,7 @@ class Frames:
         Images with alpha need a background (3,) in [0, 1], as the renderer has it (else ValueError); opaque ones ignore
         it.
         """
-        pixels = self.images[index].float() / 255
+        pixels = self.stored_image(index).float() / 255
         if not self.has_alpha:
             return pixels
         if background is None:
@@ -124,20 +170,18 @@ class Frames:
         """Rays (B), each at its frame's time, and premultiplied colours (B, 4) float32 (alpha 1 if opaque) of any
         pixels.
 
-        Indices (B,) int64 in [0, num_pixels), on the images' device, are `(frame * H + row) * W + column`; ValueError
-        for another shape or type.
+        Indices (B,) int64 in [0, num_pixels), on the images' device, count frame after frame, each row by row, see
+        `layout`; ValueError for another shape or type.
         """
         check_shape("indices", indices, ("B",))
         if indices.dtype != torch.int64:
             raise ValueError(f"indices must be int64, got {indices.dtype}")
-        _, height, width, channels = self.images.shape
-        rgba = self.images.view(-1, channels).index_select(0, indices).float() / 255
+        rgba = self.images.view(-1, self.images.shape[-1]).index_select(0, indices).float() / 255
         if not self.has_alpha:
             rgba = torch.nn.functional.pad(rgba, (0, 1), value=1.0)
-        rows = indices // width
-        frames = rows // height
+        frames, rows, columns = self.layout.locate(indices)
         rays = camera_rays(
-            self.intrinsics, self.poses.index_select(0, frames), indices - rows * width, rows - frames * height,
+            self._lenses.of(frames), self.poses.index_select(0, frames), columns, rows,
             times=self.times.index_select(0, frames), near=self.near, far=self.far,
         )  # fmt: skip
         return rays, rgba
@@ -146,10 +190,22 @@ class Frames:
         """The frames with the given indices, in that order (a copy); ValueError for none, or one that is not there."""
         if not len(indices) or not all(-len(self) <= i < len(self) for i in indices):
             raise ValueError(f"indices must name some of {len(self)} frames, got {list(indices)[:8]}")
-        chosen = torch.as_tensor([i % len(self) for i in indices], device=self.images.device)
-        images, poses, times = (values.index_select(0, chosen) for values in (self.images, self.poses, self.times))
-        names = tuple(self.names[i] for i in indices) if self.names else ()
-        return replace(self, images=images, poses=poses, times=times, names=names)
+        rows = [i % len(self) for i in indices]
+        chosen = torch.as_tensor(rows, device=self.poses.device)
+        names = tuple(self.names[i] for i in rows) if self.names else ()
+        return replace(
+            self, images=self._images_of(rows), poses=self.poses[chosen], times=self.times[chosen], names=names,
+            intrinsics=tuple(self.intrinsics[i] for i in rows),
+        )  # fmt: skip
+
+    def _images_of(self, rows: Sequence[int]) -> Tensor:
+        parts = [self.stored_image(i) for i in rows]
+        is_shared = len({part.shape for part in parts}) == 1
+        height, width, channels = parts[0].shape
+        num_pixels = sum(part.shape[0] * part.shape[1] for part in parts)
+        images = empty_pixels((num_pixels, channels), device=self.images.device)
+        torch.cat([part.flatten(0, 1) for part in parts], out=images)
+        return images.view(-1, height, width, channels) if is_shared else images
 
     def to(self, device: str | torch.device) -> "Frames":
         """The same frames on another device."""

@@ -6,54 +6,113 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageFile
 
 MAX_PIXELS = 2**25
 MAX_SIDE = 2**14
 FORMATS = ("PNG", "JPEG")
-MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
+MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16")
 BAND_PIXELS = 2**15
+ORIENTATION = 0x0112  # tag of EXIF: how an image as stored is turned upright
+TURNED = (5, 6, 7, 8)  # its values that swap width and height
 
 Bytes = NDArray[np.uint8]
 
 
-def read_header(path: Path) -> tuple[int, int, bool]:
-    """Width, height and whether an image file has alpha, without decoding it.
+def read_header(path: Path, *, upright: bool = True) -> tuple[int, int, bool]:
+    """Width, height and whether an image file has alpha, without decoding it; turned as its EXIF data say if `upright`.
 
-    Raises ValueError naming the file, if it is missing, not a PNG or JPEG with 8 bits per channel, or larger than 2^25
-    pixels or 2^14 on a side.
+    Raises ValueError naming the file, if it is missing, not a PNG or JPEG, or larger than 2^25 pixels or 2^14 on a
+    side.
     """
     with _open(path) as image:
         try:
-            return image.width, image.height, image.has_transparency_data
+            width, height = image.size
+            if upright and _orientation(image) in TURNED:
+                width, height = height, width
+            return width, height, image.has_transparency_data
         except AssertionError as error:
             raise ValueError(f"{path}: image has colours of a palette, but no palette") from error
 
 
-def read_image(path: Path, *, width: int, height: int, channels: int, size: tuple[int, int]) -> Bytes:
+def read_image(
+    path: Path,
+    *,
+    width: int,
+    height: int,
+    channels: int,
+    size: tuple[int, int],
+    mask: Path | None = None,
+    upright: bool = True,
+) -> Bytes:
     """Decode an image, premultiply by alpha, average over pixel areas and round once: (height, width, channels) uint8.
 
-    Palettes and grey are expanded to colour.
+    Palettes and grey are expanded to colour, 16 bits rounded to 8.
 
     Args:
         path: a PNG or JPEG file of `size`, (width, height).
         width: columns of the result, at most the file's.
         height: rows of the result, at most the file's.
         channels: 4 for premultiplied colour and alpha, 3 for an image that is opaque everywhere.
+        mask: an image file that multiplies alpha, see `read_mask`.
+        upright: whether to turn the image as its EXIF data say; `size` is that of the turned one.
 
     Raises:
         ValueError: naming the file, as `read_header`, or if it is truncated, of another size, or transparent somewhere
             where `channels` is 3.
     """
     with _open(path) as image:
-        if image.size != size:
-            raise ValueError(f"{path}: image must be {size[0]} x {size[1]}, got {image.width} x {image.height}")
         pixels = _decoded(image, path, with_alpha=channels == 4)
+        if upright:
+            pixels = _turned(pixels, _orientation(image))
+    return finish_image(pixels, path, width=width, height=height, channels=channels, size=size, mask=mask)
+
+
+def finish_image(
+    pixels: Bytes, path: Path, *, width: int, height: int, channels: int, size: tuple[int, int], mask: Path | None
+) -> Bytes:
+    """What `read_image` does with decoded pixels (H, W, 3 or 4) of straight alpha."""
+    if pixels.shape[1::-1] != size:
+        raise ValueError(f"{path}: image must be {size[0]} x {size[1]}, got {pixels.shape[1]} x {pixels.shape[0]}")
+    if mask is not None:
+        kept = read_mask(mask, size)
+        if pixels.shape[-1] == 4:
+            kept = ((pixels[..., 3].astype(np.uint16) * kept + 127) // 255).astype(np.uint8)
+        pixels = np.concatenate([pixels[..., :3], kept[..., None]], axis=-1)
     if pixels.shape[-1] > channels:
         if pixels[..., 3].min() < 255:
-            raise ValueError(f"{path}: image must be opaque, as the training images are, got transparent pixels")
+            raise ValueError(
+                f"{mask or path}: image must be opaque, as the training images are, got transparent pixels"
+            )
         pixels = pixels[..., :channels]
+    elif pixels.shape[-1] < channels:
+        pixels = np.pad(pixels, ((0, 0), (0, 0), (0, 1)), constant_values=255)
     return premultiplied_area_average(pixels, width, height)
+
+
+def read_mask(path: Path, size: tuple[int, int]) -> Bytes:
+    """What an image file keeps of an image of `size`, (width, height): (height, width) uint8, 255 is all.
+
+    It is the file's brightness times its alpha. A larger file is averaged over pixel areas; ValueError, naming the
+    file, for a smaller one or another shape.
+    """
+    with _open(path) as image:
+        pixels = _turned(_decoded(image, path, with_alpha=True), _orientation(image))
+    # Colours stand for the brightest of their channels, for masks are drawn in any.
+    kept = pixels[..., :3].max(-1).astype(np.uint16) * pixels[..., 3]
+    mask = ((kept + 127) // 255).astype(np.uint8)
+    width, height = size
+    if not has_shape((mask.shape[1], mask.shape[0]), size) or mask.shape[0] < height or mask.shape[1] < width:
+        raise ValueError(
+            f"{path}: mask must be {width} x {height} as its image, or larger and of that shape, "
+            f"got {mask.shape[1]} x {mask.shape[0]}"
+        )
+    return premultiplied_area_average(mask[..., None], width, height)[..., 0]
+
+
+def has_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) are of one image, enlarged or reduced and rounded to whole pixels."""
+    return abs(size[0] * other[1] - size[1] * other[0]) < max(sum(size), sum(other))
 
 
 def is_transparent(path: Path) -> bool:
@@ -143,14 +202,12 @@ def _interval_sums(values: NDArray, n: int, m: int, first: int, last: int, offse
     return edges[1:] - edges[:-1]
 
 
-def _open(path: Path) -> Image.Image:
+def _open(path: Path) -> ImageFile.ImageFile:
     """Open an image whose header promises something we decode; the file stays open until the image is closed."""
     try:
         # Opening a pipe would wait for ever.
         if not stat.S_ISREG(path.stat().st_mode):
             raise OSError("not a regular file")
-        with path.open("rb") as file:
-            head = file.read(25)
         image = Image.open(path, formats=FORMATS)
     except FileNotFoundError:
         raise ValueError(f"{path}: image does not exist") from None
@@ -163,9 +220,6 @@ def _open(path: Path) -> Image.Image:
     width, height = image.size
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
         problem = f"at most {MAX_PIXELS} pixels and {MAX_SIDE} on a side, got {width} x {height}"
-    # Pillow would cut 16 bits to 8 without a word.
-    elif head.startswith(b"\x89PNG") and head[24] > 8:
-        problem = f"of 8 bits per channel, got {head[24]}"
     elif image.mode not in MODES:
         problem = f"grey, palette, RGB or RGBA, got {image.mode}"
     else:
@@ -174,14 +228,69 @@ def _open(path: Path) -> Image.Image:
     raise ValueError(f"{path}: image must be {problem}")
 
 
-def _decoded(image: Image.Image, path: Path, *, with_alpha: bool) -> Bytes:
+def _decoded(image: ImageFile.ImageFile, path: Path, *, with_alpha: bool) -> Bytes:
     """Pixels (H, W, 4) uint8 with straight alpha, or (H, W, 3) if the file has none and none is wanted."""
     try:
+        if "16B" in str(image.tile):
+            return _rounded(_sixteen_bits(image, path), image.info.get("transparency"), with_alpha=with_alpha)
         mode = "RGBA" if with_alpha or image.has_transparency_data else "RGB"
         return np.asarray(image if image.mode == mode else image.convert(mode))
     # A decoder given hostile bytes raises many types (OSError, SyntaxError, zlib.error, struct.error, ...).
     except Exception as error:
         raise ValueError(f"{path}: image is truncated or broken: {_one_line(error)}") from error
+
+
+def _sixteen_bits(image: ImageFile.ImageFile, path: Path) -> NDArray[np.uint16]:
+    """Grey, grey with alpha, RGB or RGBA, (H, W, 1 to 4), of a PNG of 16 bits.
+
+    Pillow keeps the upper eight of colour and alpha only, so that bytes are read one by one: those of grey with alpha
+    as the four channels of a pixel, those of RGB and RGBA by reading the file twice, the lower ones as if they were the
+    upper ones of numbers with the lower byte first.
+    """
+    codec, extents, offset, rawmode = image.tile[0]
+    if image.mode == "I;16":
+        return np.asarray(image)[..., None]
+    if rawmode == "LA;16B":
+        image.tile = [(codec, extents, offset, "RGBA")]  # type: ignore[list-item]
+        parts = np.asarray(image).astype(np.uint16)
+        return parts[..., 0::2] * np.uint16(256) + parts[..., 1::2]
+    with _open(path) as again:
+        again.tile = [(codec, extents, offset, f"{image.mode};16L")]  # type: ignore[list-item]
+        lower = np.asarray(again).astype(np.uint16)
+    return np.asarray(image).astype(np.uint16) * np.uint16(256) + lower
+
+
+def _rounded(pixels: NDArray[np.uint16], transparent: object, *, with_alpha: bool) -> Bytes:
+    """Pixels of 16 bits as colour of 8, with alpha if they have any, or one colour is transparent, or it is wanted."""
+    color, alpha = (pixels[..., :-1], pixels[..., -1]) if pixels.shape[-1] % 2 == 0 else (pixels, None)
+    if transparent is not None and alpha is None:
+        alpha = np.where((color == np.asarray(transparent)).all(-1), np.uint16(0), np.uint16(65535))
+    if alpha is None and with_alpha:
+        alpha = np.full(color.shape[:2], 65535, np.uint16)
+    parts = [np.broadcast_to(color, (*color.shape[:2], 3))] + ([] if alpha is None else [alpha[..., None]])
+    # 65535 = 255 * 257
+    return ((np.concatenate(parts, axis=-1).astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def _orientation(image: Image.Image) -> int:
+    """How an image is to be turned, 1 to 8 as in EXIF; 1, for not at all, where its header says nothing or nonsense."""
+    # Without these a PNG would be decoded, to look behind its pixels.
+    if "exif" not in image.info:
+        return 1
+    try:
+        found = image.getexif().get(ORIENTATION, 1)
+    except Exception:  # noqa: BLE001 (hostile bytes raise many types here, too)
+        return 1
+    return found if found in range(1, 9) else 1
+
+
+def _turned(pixels: Bytes, orientation: int) -> Bytes:
+    """Pixels (H, W, C) upright."""
+    if orientation in TURNED:
+        pixels = pixels.swapaxes(0, 1)
+    # After that, columns are to be mirrored for 2, 3, 6 and 7, and rows for 3, 4, 7 and 8.
+    columns, rows = orientation in (2, 3, 6, 7), orientation in (3, 4, 7, 8)
+    return np.ascontiguousarray(pixels[:: -1 if rows else 1, :: -1 if columns else 1])
 
 
 def _one_line(error: Exception) -> str:

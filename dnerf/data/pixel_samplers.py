@@ -2,12 +2,14 @@
 
 from abc import ABC, abstractmethod
 from bisect import bisect_right
+from itertools import accumulate
 
 import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import check_positive, check_whole
 from dnerf.data.frames import Frames
+from dnerf.data.pixel_layout import PixelLayout
 
 SAME_TIME = 1e-6  # frames no further from the origin than others are in with them
 UNKNOWN = 1.0  # error of a block that was never drawn: as wrong as colours can be
@@ -82,14 +84,20 @@ class TemporalCurriculum(PixelSampler, FrameSubset):
             if value > 1:
                 raise ValueError(f"{name} must be in (0, 1], got {value}")
         self.origin, self.end, self.start = origin, end, start
-        self._size = 0  # pixels of a frame
         self._nearest = torch.empty(0, dtype=torch.int64)  # frames from the origin outwards
+        self._counts: list[int] = []  # pixels of those frames, up to and with each
+        self._ends = torch.empty(0, dtype=torch.int64)  # the same
+        self._shifts = torch.empty(0, dtype=torch.int64)  # from those pixels to those of all frames
         self._distances: list[float] = []  # of those
 
     def begin(self, frames: Frames) -> None:
         """Sort the frames by their distance in time from the origin."""
-        self._size = frames.num_pixels // len(frames)
         distances, self._nearest = (frames.times - self.origin).abs().sort(stable=True)
+        starts = frames.layout.starts
+        order = self._nearest.tolist()
+        self._counts = list(accumulate(starts[i + 1] - starts[i] for i in order))
+        self._ends = torch.tensor(self._counts, device=self._nearest.device)
+        self._shifts = torch.tensor([starts[i + 1] for i in order], device=self._nearest.device) - self._ends
         self._distances = distances.tolist()
 
     def frames_in(self, progress: float) -> Tensor | None:
@@ -104,9 +112,11 @@ class TemporalCurriculum(PixelSampler, FrameSubset):
     def draw(self, count: int, progress: float, generator: torch.Generator) -> Tensor:
         """Pixels (count,) of the frames that are in."""
         frames = self.frames_in(progress)
-        num_frames = len(self._distances) if frames is None else len(frames)
-        drawn = torch.randint(num_frames * self._size, (count,), generator=generator, device=generator.device)
-        return drawn if frames is None else frames[drawn // self._size] * self._size + drawn % self._size
+        num_pixels = self._counts[-1 if frames is None else len(frames) - 1]
+        drawn = torch.randint(num_pixels, (count,), generator=generator, device=generator.device)
+        if frames is None:
+            return drawn
+        return drawn + self._shifts[torch.searchsorted(self._ends, drawn, right=True)]
 
 
 class ErrorGuidedPixels(PixelSampler, FrameSubset):
@@ -135,7 +145,7 @@ class ErrorGuidedPixels(PixelSampler, FrameSubset):
             raise ValueError(f"memory must be in [0, 1), got {memory}")
         self.pixels = pixels
         self.share, self.resolution, self.memory = share, resolution, memory
-        self._sides = (0, 0)
+        self._layout: PixelLayout | None = None
         self._block = 1
         self.register_buffer("errors", torch.empty(0, 0, 0))
         self.errors: Tensor
@@ -143,11 +153,15 @@ class ErrorGuidedPixels(PixelSampler, FrameSubset):
     def begin(self, frames: Frames) -> None:
         """Know nothing of these frames; unknown blocks are drawn first."""
         self.pixels.begin(frames)
-        num_frames, height, width = frames.images.shape[:3]
-        self._sides = (height, width)
-        self._block = -(-max(height, width) // self.resolution)
-        rows, columns = (-(-side // self._block) for side in self._sides)
-        self.errors = torch.full((num_frames, rows, columns), UNKNOWN, device=frames.images.device)
+        self._layout = frames.layout
+        sizes = frames.layout.sizes
+        self._block = -(-max(map(max, sizes)) // self.resolution)
+        blocks = [[-(-side // self._block) for side in size] for size in sizes]
+        rows, columns = (max(each[axis] for each in blocks) for axis in (0, 1))
+        self.errors = torch.full((len(frames), rows, columns), UNKNOWN, device=frames.images.device)
+        # Blocks beyond a smaller frame are never drawn.
+        for errors, (rows, columns) in zip(self.errors, blocks):
+            errors[rows:], errors[:, columns:] = 0, 0
 
     def frames_in(self, progress: float) -> Tensor | None:
         """See `FrameSubset`: those of the other pixel sampler."""
@@ -157,7 +171,7 @@ class ErrorGuidedPixels(PixelSampler, FrameSubset):
         """Pixels (count,), the guided ones last."""
         even = self.pixels.draw(count, progress, generator)
         guided = int(self.share * count)
-        height, width = self._sides
+        assert self._layout is not None
         frames_in = self.frames_in(progress)
         errors = self.errors if frames_in is None else self.errors.index_select(0, frames_in)
         bounds = errors.reshape(-1).cumsum(0, dtype=torch.float64)
@@ -166,16 +180,17 @@ class ErrorGuidedPixels(PixelSampler, FrameSubset):
         frames, within = blocks // errors[0].numel(), blocks % errors[0].numel()
         if frames_in is not None:
             frames = frames_in[frames]
+        height, width = self._layout.sides(frames)
         rows = self._within(within // errors.shape[2], unit[1], height)
         columns = self._within(within % errors.shape[2], unit[2], width)
-        return torch.cat([even[: count - guided], (frames * height + rows) * width + columns])
+        return torch.cat([even[: count - guided], self._layout.index(frames, rows, columns)])
 
     @torch.no_grad()
     def feedback(self, indices: Tensor, errors: Tensor) -> None:
         """Enter squared errors; one that is no number counts as unknown."""
         self.pixels.feedback(indices, errors)
-        height, width = self._sides
-        frames, rows, columns = indices // (height * width), indices // width % height, indices % width
+        assert self._layout is not None
+        frames, rows, columns = self._layout.locate(indices)
         blocks = frames * self.errors.shape[1] + rows // self._block
         blocks = blocks * self.errors.shape[2] + columns // self._block
         known = self.errors.view(-1)
@@ -188,7 +203,7 @@ class ErrorGuidedPixels(PixelSampler, FrameSubset):
         now = torch.where(before < UNKNOWN, torch.lerp(now, before, self.memory), now)
         known[blocks] = torch.where(counts[blocks] > 0, now, before)
 
-    def _within(self, blocks: Tensor, unit: Tensor, side: int) -> Tensor:
+    def _within(self, blocks: Tensor, unit: Tensor, side: int | Tensor) -> Tensor:
         """Random rows or columns of blocks; the last block may be cut."""
         begins = blocks * self._block
         return begins + (unit * (side - begins).clamp(max=self._block)).long()

@@ -1,47 +1,56 @@
-"""Where frames come from: a folder in D-NeRF's format, or an analytic scene."""
+"""Where frames come from: the door of data sources, and exact scenes."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from functools import cached_property
 from numbers import Real
-from pathlib import Path
 
 from torch import Tensor
 
 from dnerf.core.backgrounds import parse_color
-from dnerf.core.checks import as_box, check_choice, check_positive, check_whole
+from dnerf.core.cameras import Intrinsics
+from dnerf.core.checks import as_box, check_choice, check_whole
 from dnerf.data.bounds import fit_box
-from dnerf.data.formats.blender import check_blender, has_transparency, load_blender
 from dnerf.data.frames import Frames
-from dnerf.data.synthetic import random_views, render_frames
+from dnerf.data.scene_record import Box, CameraSet, SceneRecord, World
+from dnerf.data.synthetic import DNERF_ANGLE_X, random_views, render_frames
 from dnerf.scenes import AnalyticScene
 
 SPLITS = ("train", "val", "test")
 DIGITS = 4  # of the longest side, to which a fitted box is rounded, outwards
 
 
-class DataSource(ABC):
-    """Frames of a scene by split, and the box that is modelled."""
+class NoImages(ValueError):
+    """A split that a data set does not have, or of which it has cameras alone."""
 
-    box: Tensor | None  # (2, 3), in world units; None fits it to the training frames
+
+class DataSource(ABC):
+    """Frames of a scene by split, in the world that models live in."""
+
     train_end: float | None = None  # last time that training frames may have; None for all
 
     @abstractmethod
     def frames(self, split: str) -> Frames:
-        """Frames of "train", "val" or "test"; ValueError for another split or broken data."""
+        """Frames of "train", "val" or "test", in world units; ValueError for another split or broken data."""
 
-    def fitted_box(self, frames: Frames) -> list[list[float]]:
-        """Lowest and highest corner of what is modelled: as given, or fitted to the training frames, see `fit_box`."""
-        if self.box is not None:
-            return self.box.tolist()
-        low, high = fit_box(frames).tolist()
-        unit = 10.0 ** (math.floor(math.log10(max(high[i] - low[i] for i in range(3)))) + 1 - DIGITS)
-        corners = [[math.floor(x / unit) * unit for x in low], [math.ceil(x / unit) * unit for x in high]]
-        return [[float(f"{x:.10g}") for x in corner] for corner in corners]
+    @abstractmethod
+    def world(self) -> World:
+        """Where the scene stands in the world: as settled, else found from the training frames."""
+
+    @abstractmethod
+    def settle(self, world: World) -> None:
+        """Stand where a run of this scene has its world, rather than find one anew."""
+
+    @abstractmethod
+    def cameras(self) -> dict[str, CameraSet]:
+        """Cameras and times of every split, in world units; no pixel is read or rendered."""
+
+    def record(self) -> SceneRecord:
+        """What a run keeps of this scene."""
+        return SceneRecord(self.world(), self.cameras())
 
     def check(self, split: str) -> None:
-        """Raise what `frames` would of a split that is not there, or is broken as far as can be seen in no time."""
+        """Raise what `frames` would of a split, as far as can be seen in no time; `NoImages` if it has none."""
         check_choice("split", split, SPLITS)
 
     def _known(self, frames: Frames, split: str) -> Frames:
@@ -54,71 +63,32 @@ class DataSource(ABC):
         return frames.subset(kept)
 
 
-def _given_box(box: str | Sequence[Sequence[float]]) -> Tensor | None:
+def given_box(box: str | Sequence[Sequence[float]]) -> Tensor | None:
+    """Corners (2, 3) of a box, None for "auto"; ValueError for anything else."""
     if isinstance(box, str):
         check_choice("box", box, ("auto",))
         return None
     return as_box(box)
 
 
-def _check_train_end(train_end: float | None) -> None:
+def as_corners(corners: Sequence[Sequence[float]]) -> Box:
+    """Two corners as tuples."""
+    low, high = corners
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+def _rounded(box: Tensor) -> Box:
+    """A fitted box with corners that are short to write, rounded outwards."""
+    low, high = box.tolist()
+    unit = 10.0 ** (math.floor(math.log10(max(high[i] - low[i] for i in range(3)))) + 1 - DIGITS)
+    corners = [[math.floor(x / unit) * unit for x in low], [math.ceil(x / unit) * unit for x in high]]
+    return as_corners([[float(f"{x:.10g}") for x in corner] for corner in corners])
+
+
+def check_train_end(train_end: float | None) -> None:
+    """Raise ValueError unless a time in [0, 1], or None."""
     if train_end is not None and (not isinstance(train_end, Real) or not 0 <= train_end <= 1):
         raise ValueError(f"train_end must be in [0, 1] or None, got {train_end}")
-
-
-class BlenderData(DataSource):
-    """A scene folder in D-NeRF's format.
-
-    If no pixel of the training images is transparent, no split has alpha, whatever the files' headers say.
-
-    Args:
-        root: folder that holds `transforms_<split>.json`.
-        resolution: width in pixels after area averaging; None keeps the files' size.
-        box: (2, 3) corners of what is modelled, in world units; "auto" fits them to the training frames.
-        near: z-depth where rays begin; None takes what the file says, 2 if nothing.
-        far: z-depth where they end; None takes what the file says, 6 if nothing.
-        pixel_origin: "center", or "corner" as D-NeRF's code; None takes what the file says, "center" if nothing.
-        train_end: train on frames up to this time in [0, 1] only, for extrapolation; None for all.
-    """
-
-    def __init__(
-        self,
-        root: str,
-        resolution: int | None = 400,
-        box: str | Sequence[Sequence[float]] = "auto",
-        *,
-        near: float | None = None,
-        far: float | None = None,
-        pixel_origin: str | None = None,
-        train_end: float | None = None,
-    ) -> None:
-        _check_train_end(train_end)
-        if not isinstance(root, str | Path):
-            raise ValueError(f"root must be a data set's folder, got {root!r}")
-        for name, plane in (("near", near), ("far", far)):
-            if plane is not None:
-                check_positive(name, plane, allow_zero=name == "near")
-        self.root, self.resolution, self.box, self.train_end = root, resolution, _given_box(box), train_end
-        self.near, self.far, self.pixel_origin = near, far, pixel_origin
-
-    def frames(self, split: str) -> Frames:
-        """Read a split; see `load_blender` for what can be wrong with it."""
-        check_choice("split", split, SPLITS)
-        frames = load_blender(
-            self.root, split, self.resolution, near=self.near, far=self.far, pixel_origin=self.pixel_origin,
-            has_alpha=self._has_alpha,
-        )  # fmt: skip
-        return self._known(frames, split)
-
-    @cached_property
-    def _has_alpha(self) -> bool | None:
-        """Whether training images are transparent somewhere; None without them, where each split goes by its own."""
-        return has_transparency(self.root) if (Path(self.root) / "transforms_train.json").exists() else None
-
-    def check(self, split: str) -> None:
-        """Read a split's file and its images' headers, see `DataSource.check`."""
-        super().check(split)
-        check_blender(self.root, split)
 
 
 class SyntheticData(DataSource):
@@ -146,7 +116,7 @@ class SyntheticData(DataSource):
         background: str | Sequence[float] | None = None,
         train_end: float | None = None,
     ) -> None:
-        _check_train_end(train_end)
+        check_train_end(train_end)
         check_whole("resolution", resolution)
         self.num_frames = {"train": num_train, "val": num_val, "test": num_test}
         for split, count in self.num_frames.items():
@@ -155,13 +125,48 @@ class SyntheticData(DataSource):
             raise ValueError(f"scene must be an exact scene (scene=<name>), got {scene!r}")
         if not isinstance(seed, int):
             raise ValueError(f"seed must be a whole number, got {seed!r}")
-        self.scene, self.resolution, self.box, self.train_end = scene, resolution, _given_box(box), train_end
-        self.seed = seed
+        self.scene, self.resolution, self.train_end, self.seed = scene, resolution, train_end, seed
+        self._box = given_box(box)
+        self._world: World | None = None
+        self._train: Frames | None = None  # rendered to fit the box, and not yet taken
         self.background = None if background is None else parse_color(background)
 
     def frames(self, split: str) -> Frames:
         """Render a split exactly."""
         check_choice("split", split, SPLITS)
-        seed = self.seed + 1000 * SPLITS.index(split)
-        poses, times = random_views(self.num_frames[split], midway=split != "train", seed=seed)
+        if split == "train" and self._train is not None:
+            frames, self._train = self._train, None
+            return frames
+        poses, times = self._views(split)
         return self._known(render_frames(self.scene, poses, times, self.resolution, background=self.background), split)
+
+    def world(self) -> World:
+        """Exact scenes are made in world units: their similarity is the identity."""
+        if self._world is None:
+            if self._box is None:
+                self._train = self.frames("train")
+                box, by = _rounded(fit_box(self._train)), "fitted to the frames"
+            else:
+                box, by = as_corners(self._box.tolist()), "as given"
+            note = f"box: {[list(corner) for corner in box]}, {by}"
+            self._world = World(box, has_alpha=self.background is None, notes=(note,))
+        return self._world
+
+    def settle(self, world: World) -> None:
+        """See `DataSource.settle`."""
+        self._world = world
+
+    def cameras(self) -> dict[str, CameraSet]:
+        """See `DataSource.cameras`."""
+        lens = Intrinsics.from_angle(self.resolution, self.resolution, DNERF_ANGLE_X)
+        result = {}
+        for split in SPLITS:
+            poses, times = self._views(split)
+            if split == "train" and self.train_end is not None:
+                poses, times = poses[times <= self.train_end], times[times <= self.train_end]
+            result[split] = CameraSet(poses, times, (lens,) * len(times))
+        return result
+
+    def _views(self, split: str) -> tuple[Tensor, Tensor]:
+        seed = self.seed + 1000 * SPLITS.index(split)
+        return random_views(self.num_frames[split], midway=split != "train", seed=seed)

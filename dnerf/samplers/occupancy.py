@@ -226,14 +226,18 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
 
     @torch.no_grad()
     def visible_rays(self, camera: Camera, time: float) -> tuple[Tensor, Rays] | None:
-        """Pixels that occupied cells cover, see `footprints`, and their rays; all if a cell lies beside the camera.
+        """Pixels that occupied cells cover, see `footprints`, and their rays; None if that cannot be told.
+
+        So it is if a cell lies beside the camera, or its lens is distorted.
 
         So a frame costs what the body covers, not what the image holds. Rays begin and end, a whole number of
         intervals away from where they did, before and behind the cells that cover them: their intervals stay, up to
         rounding.
         """
-        grid, lens, view = self.march_grid(time, camera.pose.dtype), camera.intrinsics.lens, camera.intrinsics
-        covered = footprints(grid.occupancy, grid.aabb, camera.pose, lens, (view.height, view.width))
+        grid, view = self.march_grid(time, camera.pose.dtype), camera.intrinsics
+        if view.distortion is not None:
+            return None
+        covered = footprints(grid.occupancy, grid.aabb, camera.pose, view.pinhole, (view.height, view.width))
         if covered is None:
             return None
         rays = camera.rays(time, covered.pixels)

@@ -8,6 +8,7 @@ from typing import Any
 
 from dnerf.core.checks import check_whole
 from dnerf.core.files import write_text
+from dnerf.data.scene_record import SCENE, SceneRecord
 from dnerf.data.source import DataSource
 from dnerf.evaluation.scores import evaluate
 from dnerf.training.callbacks import Callback
@@ -76,6 +77,8 @@ class Previews(Callback):
         """Read the frame; a continued run goes on after the images that are there."""
         self._folder = run.folder_for(self) / "previews"
         if run.processes.is_first:
+            if (run.folder_for(self) / SCENE).exists():
+                self.data.settle(SceneRecord.read(run.folder_for(self)).world)
             frames = self.data.frames(self.split)
             self._frame = frames.subset([len(frames) // 2])
         steps = [int(path.stem.partition("_")[2]) for path in self._folder.glob("step_*.png")]

@@ -8,9 +8,9 @@ from torch import Tensor
 from dnerf.core.backgrounds import Background, RandomBackground
 from dnerf.core.checks import as_box
 from dnerf.core.schedules import Ramp
+from dnerf.data.folder import FolderData
 from dnerf.data.frames import Frames
 from dnerf.data.pixel_samplers import ErrorGuidedPixels, TemporalCurriculum
-from dnerf.data.source import BlenderData
 from dnerf.deformations import AlongRaysDeformation, CachedDeformation, Deformation, DisplacementDeformation
 from dnerf.fields import DeformedField, GridField, RadianceField
 from dnerf.losses import AppearanceConstancyLoss, ElasticLoss, PhotometricLoss, TimeEmbeddingLoss, UnseenSpaceLoss
@@ -24,18 +24,18 @@ from dnerf.training.trainer import Trainer
 Corners = Tensor | Sequence[Sequence[float]]
 
 
-def load_dataset(path: str | Path, split: str = "train", resolution: int | None = 400) -> Frames:
-    """Frames of a data set's folder in D-NeRF's format.
+def load_dataset(path: str | Path, split: str = "train", resolution: int | None = None) -> Frames:
+    """Frames of a data set's folder, of any format that is read, in world units: see `FolderData` for more.
 
     Args:
-        path: of the folder that holds `transforms_<split>.json`.
+        path: of the folder.
         split: "train", "val" or "test".
-        resolution: width in pixels after area averaging; None keeps the files' size.
+        resolution: width in pixels after area averaging; None keeps the files' size, at most 400.
 
     Raises:
         ValueError: naming the file that is missing or broken.
     """
-    return BlenderData(str(path), resolution).frames(split)
+    return FolderData(path, resolution).frames(split)
 
 
 def make_renderer(

@@ -13,6 +13,7 @@ import torch
 import yaml
 
 import dnerf
+from dnerf.data.scene_record import SceneRecord
 from dnerf.data.source import DataSource
 from dnerf.rendering.renderer import Renderer
 from dnerf.scenes import SCENES
@@ -52,7 +53,16 @@ class LoadedRun:
         data = build(self.config["data"], "data")
         if not isinstance(data, DataSource):
             raise ValueError(f"{self.folder / CONFIG}: data must be a DataSource, got {type(data).__name__}")
+        data.settle(self.scene().world)
         return data
+
+    def scene(self) -> SceneRecord:
+        """Cameras and times of its frames, and the way back to the data set's own units; needs no data set.
+
+        Raises:
+            ValueError: if `scene.json` is missing or damaged.
+        """
+        return SceneRecord.read(self.folder)
 
 
 def load_run(folder: str | Path, device: str | torch.device = "cpu") -> LoadedRun:

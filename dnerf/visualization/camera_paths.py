@@ -8,11 +8,7 @@ import torch
 from torch import Tensor
 
 from dnerf.core.cameras import look_at
-from dnerf.core.checks import as_box, check_positive, check_shape
-from dnerf.core.geometry import cube_corners
-
-# Least distance of the planes, in world units: a box behind the camera leaves an empty film, not an error.
-MIN_DEPTH = 1e-3
+from dnerf.core.checks import check_positive, check_shape
 
 
 def pose_around(target: Sequence[float], *, radius: float, azimuth: float, elevation: float) -> Tensor:
@@ -42,15 +38,20 @@ def spiral_path(
     target: Sequence[float] = (0.0, 0.0, 0.0),
     turns: float = 2.0,
     start_angle: float = 0.0,
+    sway: float | None = None,
 ) -> Tensor:
-    """Poses (num_poses, 4, 4) circling `target` while rising from one elevation to the other and back."""
+    """Poses (num_poses, 4, 4) circling `target` while rising from one elevation to the other and back.
+
+    With `sway`, an angle, the path does not go round but so far to either side of `start_angle`, `turns` times.
+    """
     check_positive("num_poses", num_poses)
     poses = []
     for i in range(num_poses):
         phase = 2 * math.pi * i / num_poses
         rise = 0.5 * (1 - math.cos(phase))
         elevation = elevations[0] + rise * (elevations[1] - elevations[0])
-        poses.append(pose_around(target, radius=radius, azimuth=start_angle + turns * phase, elevation=elevation))
+        azimuth = start_angle + (turns * phase if sway is None else sway * math.sin(turns * phase))
+        poses.append(pose_around(target, radius=radius, azimuth=azimuth, elevation=elevation))
     return torch.stack(poses)
 
 
@@ -59,18 +60,3 @@ def fixed_path(num_poses: int, pose: Tensor) -> Tensor:
     check_positive("num_poses", num_poses)
     check_shape("pose", pose, (4, 4))
     return pose.expand(num_poses, 4, 4)
-
-
-def box_planes(poses: Tensor, box: Sequence[Sequence[float]] | Tensor) -> list[tuple[float, float]]:
-    """Near and far z-depths between which cameras (F, 4, 4) have a whole box (2, 3): F pairs 0 <= near < far.
-
-    A film's cameras are elsewhere than the data's: their planes follow from where they are. Near is 0 where the camera
-    is within the box's depths.
-    """
-    check_shape("poses", poses, ("F", 4, 4))
-    corners = as_box(box).to(poses)
-    places = torch.lerp(corners[0], corners[1], cube_corners(poses.device).to(poses.dtype))
-    offsets = places - poses[:, None, :3, 3]
-    depths = -(offsets * poses[:, None, :3, 2]).sum(-1)
-    nearest, farthest = depths.amin(-1).clamp(min=0).tolist(), depths.amax(-1).clamp(min=MIN_DEPTH).tolist()
-    return list(zip(nearest, farthest))

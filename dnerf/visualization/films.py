@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from dnerf.core.checks import check_choice
 from dnerf.core.files import write_json
+from dnerf.data.normalization import IDENTITY, Clock
+from dnerf.data.scene_record import World
 from dnerf.rendering.renderer import Renderer
 from dnerf.visualization.colours import flow_image, scaled_image, value_range
 from dnerf.visualization.frame_outputs import Truth, check_outputs, render_layers
@@ -49,6 +51,7 @@ def render_frames_to(
     chunk: int = 16384,
     share: Share | None = None,
     on_frame: Callable[[int], None] | None = None,
+    unit: float = 1.0,
 ) -> int:
     """Render the frames that the store lacks, each written while the next one is rendered; returns how many.
 
@@ -57,6 +60,7 @@ def render_frames_to(
         views: the film's, as many as the store's frames; ValueError otherwise.
         share: this process's part; all frames if None.
         on_frame: called with the index of every frame written.
+        unit: world units in one of those that lengths are written in, see `render_layers`.
     """
     check_outputs(outputs)
     if len(views) != store.num_frames:
@@ -75,7 +79,7 @@ def render_frames_to(
         try:
             for index in missing:
                 following = views[index + 1] if index + 1 < len(views) else None
-                layers = render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk)
+                layers = render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk, unit=unit)
                 previous, in_hand = in_hand, None
                 if previous is not None:
                     finish(*previous)
@@ -94,13 +98,16 @@ def write_films(
     *,
     fps: float = 30.0,
     views: Sequence[View] = (),
+    world: World | None = None,
 ) -> list[Path]:
     """Make the finished files of a complete store; returns their paths.
 
     The output "rgb" (or the only one) gets the path itself with the format's suffix, others `<path>_<output>`; raw
-    arrays of all outputs go into one `<path>.npz` with the layers (F, ...), times (F,), poses (F, 4, 4) and intrinsics
-    (F, 6: width, height, focal_x, focal_y, center_x, center_y in pixels) and pixel_origin (F, text: "center" or
-    "corner", the point of a pixel that its ray passes). Depth is the distance along the ray, not the z-depth.
+    arrays of all outputs go into one `<path>.npz` with the layers (F, ...), times (F,) in [0, 1], data_times (F,) by
+    the data set's own clock, poses (F, 4, 4) in its own units, intrinsics (F, 6: width, height, focal_x, focal_y,
+    center_x, center_y in pixels) and pixel_origin (F, text: "center" or "corner", the point of a pixel that its ray
+    passes).
+    Depth is the distance along the ray, not the z-depth.
 
     Depth and deformation share one scale over all frames, of which 0.5 % of a frame's opaque pixels lie outside at
     either end; the motion wheel's length is that of the 99.5 % quantile.
@@ -108,6 +115,7 @@ def write_films(
     Args:
         formats: some of mp4, gif, png, npz.
         views: the film's, for the NPZ file.
+        world: where the data set stands, for its own units and clock in the NPZ file; None if they are the world's.
     """
     check_outputs(outputs)
     for format in formats:
@@ -115,7 +123,7 @@ def write_films(
     written = []
     for format in formats:
         if format == "npz":
-            written.append(write_npz(store, path.with_name(f"{path.name}.npz"), _facts(views, fps)))
+            written.append(write_npz(store, path.with_name(f"{path.name}.npz"), _facts(views, fps, world)))
             continue
         for output in outputs:
             name = path.name if output == "rgb" or len(outputs) == 1 else f"{path.name}_{output}"
@@ -124,9 +132,9 @@ def write_films(
     return written
 
 
-def is_empty(store: FrameStore) -> bool:
-    """Whether no frame of a complete store shows anything: the camera looks elsewhere, or the model is empty."""
-    return not any(float(frame["max_opacity"]) >= MIN_VISIBLE for frame in store)
+def empty_frames(store: FrameStore) -> list[int]:
+    """Indices of a complete store's frames that show nothing: the camera looks elsewhere, or nothing is there then."""
+    return [index for index, frame in enumerate(store) if not float(frame["max_opacity"]) >= MIN_VISIBLE]
 
 
 def write_plan(store: FrameStore, views: Sequence[View], facts: dict[str, object]) -> None:
@@ -176,16 +184,17 @@ def _longest_motion(store: FrameStore) -> float:
     return longest if longest > 0 else 1.0
 
 
-def _facts(views: Sequence[View], fps: float) -> dict[str, NDArray]:
+def _facts(views: Sequence[View], fps: float, world: World | None) -> dict[str, NDArray]:
     facts: dict[str, NDArray] = {"fps": np.asarray(fps)}
     if views:
+        similarity, clock = (IDENTITY, Clock()) if world is None else (world.similarity, world.clock)
         facts["times"] = np.array([view.time for view in views])
-        facts["poses"] = np.stack([view.camera.pose.cpu().numpy() for view in views])
+        facts["data_times"] = np.array([clock.own(view.time) for view in views])
+        poses = torch.stack([view.camera.pose.cpu() for view in views])
+        facts["poses"] = (poses if similarity == IDENTITY else similarity.poses_from_world(poses)).numpy()
         lenses, rows = [view.camera.intrinsics for view in views], []
         for lens in lenses:
-            center_x = 0.5 * lens.width if lens.center_x is None else lens.center_x
-            center_y = 0.5 * lens.height if lens.center_y is None else lens.center_y
-            rows.append([lens.width, lens.height, lens.focal_x, lens.focal_y, center_x, center_y])
+            rows.append([lens.width, lens.height, lens.focal_x, lens.focal_y, *lens.center])
         facts["intrinsics"] = np.array(rows)
         facts["pixel_origin"] = np.array([lens.pixel_origin for lens in lenses])
     return facts

@@ -47,17 +47,19 @@ def render_layers(
     *,
     truth: Truth | None = None,
     chunk: int = 16384,
+    unit: float = 1.0,
 ) -> dict[str, NDArray]:
     """Render one frame.
 
     Args:
         following: the next frame, to which motion goes; None after the last.
         truth: gives the true image (H, W, 3) of a view; needed for "compare".
+        unit: world units in one of those that lengths are given in.
 
     Returns:
         The arrays that the outputs need (see `LAYERS`), and max_opacity (), the largest opacity of the frame. rgb and
         truth (H, W, 3) uint8, rounded to the nearest. opacity (H, W) float32. depth (H, W) float32, the expected
-        distance along the ray (not the z-depth) in world units, 0 where nothing is. motion (H, W, 2) float32, pixels to
+        distance along the ray (not the z-depth), 0 where nothing is. motion (H, W, 2) float32, pixels to
         the right and down to where the surface is in the next frame, camera motion included; NaN where there is none,
         where it is unknown or not found, and after the last frame. deformation (H, W) float32, see
         `deformation_magnitude`.
@@ -75,13 +77,14 @@ def render_layers(
         if truth is None:
             raise ValueError("outputs: compare needs true images: a path through a split's frames, or an exact scene")
         arrays["truth"] = _bytes(truth(view))
-    for name, values in (("opacity", rendering.opacity), ("depth", rendering.depth)):
+    for name, values in (("opacity", rendering.opacity), ("depth", rendering.depth / unit)):
         if name in layers:
             arrays[name] = values.float().cpu().numpy()
     if "motion" in layers:
         arrays["motion"] = _motion(renderer, view, following, rendering, chunk)
     if "deformation" in layers:
-        arrays["deformation"] = deformation_magnitude(renderer, view.camera, view.time, chunk=chunk).cpu().numpy()
+        moved = deformation_magnitude(renderer, view.camera, view.time, chunk=chunk) / unit
+        arrays["deformation"] = moved.cpu().numpy()
     return arrays
 
 

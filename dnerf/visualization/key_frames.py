@@ -4,7 +4,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dnerf.core.cameras import look_at
 from dnerf.core.checks import check_choice, check_positive
+from dnerf.data.normalization import Similarity
 from dnerf.visualization.interpolation import INTERPOLATIONS, interpolate
 
 # Channels of a key frame and their number of values; each is interpolated on its own.
@@ -38,17 +39,33 @@ class KeyFrames:
             raise ValueError(f"keyframes last {count} frames at {fps} a second, at most {MAX_FRAMES} are allowed")
         return count
 
-    def sample(self, fps: float) -> tuple[Tensor, list[float], list[float | None]]:
+    def in_world(self, similarity: Similarity) -> "KeyFrames":
+        """The same film, of key frames that are in a data set's own units."""
+        channels = dict(self.channels)
+        for name in ("eye", "target"):
+            if name in channels:
+                channels[name] = channels[name][0], similarity.positions_to_world(channels[name][1])
+        if "radius" in channels:
+            channels["radius"] = channels["radius"][0], similarity.scale * channels["radius"][1]
+        return replace(self, channels=channels)
+
+    def sample(
+        self, fps: float, defaults: Mapping[str, Sequence[float]] | None = None
+    ) -> tuple[Tensor, list[float], list[float | None]]:
         """Poses (F, 4, 4), times (F) in [0, 1] and horizontal fields of view in radians (F, None: the data's own).
+
+        Args:
+            defaults: values of channels that no key frame says, before those of `DEFAULTS`.
 
         Raises ValueError naming the second, if the eye meets its target or looks straight up or down.
         """
         at = self.seconds[0] + torch.arange(self.num_frames(fps), dtype=torch.float64) / fps
-        targets = self._curve("target", at)
+        values = {**DEFAULTS, **(defaults or {})}
+        targets = self._curve("target", at, values)
         if "eye" in self.channels:
-            eyes = self._curve("eye", at)
+            eyes = self._curve("eye", at, values)
         else:
-            azimuth, elevation, radius = (self._curve(name, at)[:, 0] for name in AROUND)
+            azimuth, elevation, radius = (self._curve(name, at, values)[:, 0] for name in AROUND)
             azimuth, elevation = torch.deg2rad(azimuth), torch.deg2rad(elevation)
             across, up = elevation.cos(), elevation.sin()
             around = torch.stack([across * azimuth.cos(), across * azimuth.sin(), up], dim=-1)
@@ -59,15 +76,15 @@ class KeyFrames:
                 poses.append(look_at(eye, target))
             except ValueError as error:
                 raise ValueError(f"keyframes at {second:.3g} seconds: {error}") from error
-        times = self._curve("time", at)[:, 0].clamp(0, 1).tolist()
+        times = self._curve("time", at, values)[:, 0].clamp(0, 1).tolist()
         angles: list[float | None] = [None] * len(at)
         if "field_of_view" in self.channels:
-            angles = list(torch.deg2rad(self._curve("field_of_view", at)[:, 0]).tolist())
+            angles = list(torch.deg2rad(self._curve("field_of_view", at, values)[:, 0]).tolist())
         return torch.stack(poses), times, angles
 
-    def _curve(self, name: str, at: Tensor) -> Tensor:
+    def _curve(self, name: str, at: Tensor, defaults: Mapping[str, Sequence[float]]) -> Tensor:
         if name not in self.channels:
-            return torch.tensor(DEFAULTS[name], dtype=at.dtype).expand(len(at), -1)
+            return torch.tensor(defaults[name], dtype=at.dtype).expand(len(at), -1)
         given, values = self.channels[name]
         return interpolate(given, values, at, self.interpolation)
 
@@ -79,13 +96,12 @@ def read_key_frames(path: str | Path) -> KeyFrames:
     any of
 
     - `time` in [0, 1]: the scene's time;
-    - `azimuth`, `elevation` (degrees) and `radius` (world units) around `target`, or `eye` ([x, y, z]) instead;
+    - `azimuth`, `elevation` (degrees) and `radius` around `target`, or `eye` ([x, y, z]) instead;
     - `target` ([x, y, z]), the point looked at;
     - `field_of_view` (degrees, horizontal).
 
-    What a key frame leaves out runs on between those that say it; what no key frame says is `time` 0, `target` the
-    origin, `azimuth` 0, `elevation` 25, `radius` 4, `field_of_view` the data's. Azimuths are not wrapped: 0 to 360 is
-    one turn.
+    Lengths are in the data set's own units (`in_world`). What a key frame leaves out runs on between those that say it;
+    what no key frame says is `DEFAULTS`, or what `sample` is given. Azimuths are not wrapped: 0 to 360 is one turn.
 
     Raises ValueError naming the file and the entry, for anything else.
     """

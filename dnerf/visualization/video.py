@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from torch import Tensor
+from torch import Tensor, nn
 
 from dnerf.core.checks import check_choice, check_positive
 from dnerf.core.files import atomic_path
@@ -161,9 +161,17 @@ def contact_sheet(
 
 
 def comparison_sheet(pairs: Sequence[tuple[Tensor, Tensor]], rows: Sequence[str] = ()) -> Tensor:
-    """A contact sheet of predictions and truths, (H, W, 3) in [0, 1], and errors, with labels of its rows."""
+    """A contact sheet of predictions and truths, (H, W, 3) in [0, 1], and errors, with labels of its rows.
+
+    Pairs of different sizes are filled up with white.
+    """
+    height, width = (max((truth.shape[axis] for _, truth in pairs), default=0) for axis in (0, 1))
+
+    def filled(tile: Tensor) -> Tensor:
+        return nn.functional.pad(tile, (0, 0, 0, width - tile.shape[1], 0, height - tile.shape[0]), value=1.0)
+
     tiles = [[prediction, truth, error_map(prediction, truth)] for prediction, truth in pairs]
-    return contact_sheet(tiles, SHEET_COLUMNS, rows)
+    return contact_sheet([[filled(tile) for tile in row] for row in tiles], SHEET_COLUMNS, rows)
 
 
 def _checked(images: Iterable[Tensor | NDArray]) -> Iterator[NDArray[np.uint8]]:

@@ -34,33 +34,29 @@ class View:
 def make_views(
     poses: Tensor,
     times: Sequence[float],
-    intrinsics: Intrinsics,
+    intrinsics: Intrinsics | Sequence[Intrinsics],
     planes: Sequence[tuple[float, float]],
     *,
-    angles: Sequence[float | None] | None = None,
     have_truth: bool = False,
 ) -> list[View]:
     """Views of a path.
 
     Args:
         poses: (F, 4, 4) camera-to-world.
-        times: F times in [0, 1]; ValueError if numbers of poses, times, planes or angles differ.
+        times: F times in [0, 1]; ValueError if numbers of poses, times, intrinsics or planes differ.
+        intrinsics: of all frames, or F of them.
         planes: F z-depths (near, far) where rays begin and end, see `box_planes`.
-        angles: F horizontal fields of view in radians that replace the intrinsics' own; None keeps it.
         have_truth: whether frame i is image i of the data.
     """
     check_shape("poses", poses, (len(times), 4, 4))
-    angles = [None] * len(times) if angles is None else angles
-    for name, values in (("planes", planes), ("angles", angles)):
+    lenses = [intrinsics] * len(times) if isinstance(intrinsics, Intrinsics) else list(intrinsics)
+    for name, values in (("planes", planes), ("intrinsics", lenses)):
         if len(values) != len(times):
             raise ValueError(f"{name} must be {len(times)}, got {len(values)}")
-    views = []
-    for i, (pose, time, (near, far), angle) in enumerate(zip(poses, times, planes, angles)):
-        lens = intrinsics
-        if angle is not None:
-            lens = Intrinsics.from_angle(intrinsics.width, intrinsics.height, angle, intrinsics.pixel_origin)
-        views.append(View(Camera(lens, pose, near, far), float(time), i if have_truth else None))
-    return views
+    return [
+        View(Camera(lens, pose, near, far), float(time), i if have_truth else None)
+        for i, (pose, time, lens, (near, far)) in enumerate(zip(poses, times, lenses, planes))
+    ]
 
 
 def sequence_digest(views: Sequence[View], facts: Mapping[str, object]) -> str:

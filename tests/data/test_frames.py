@@ -114,7 +114,7 @@ def test_subset_keeps_order_and_everything_else() -> None:
     for name in ("images", "poses", "times"):
         assert torch.equal(getattr(part, name), getattr(frames, name)[[2, 0, 2]])
     assert part.names == ("c", "a", "c")
-    assert (part.near, part.far, part.intrinsics) == (0.5, 9.0, INTRINSICS)
+    assert (part.near, part.far, part.shared_intrinsics) == (0.5, 9.0, INTRINSICS)
 
 
 @pytest.mark.parametrize("indices", [[], [3], [0, -4]])

@@ -3,15 +3,16 @@ import os
 import struct
 import zlib
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, ImageOps
 
-from dnerf.data.images import premultiplied_area_average, read_header, read_image, straight_alpha
+from dnerf.data.images import premultiplied_area_average, read_header, read_image, read_mask, straight_alpha
 
 
 def loop_area_average(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -135,6 +136,105 @@ def png(width: int, height: int, depth: int = 8, color_type: int = 6, data: byte
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
+def filtered(rows: np.ndarray, chance: np.random.Generator) -> bytes:
+    """Rows (H, W, B) uint8 of pixels of B bytes, each with one of the filters none, sub, up and average."""
+    rows, above, result = rows.astype(int), np.zeros(rows.shape[1:], int), b""
+    for row in rows:
+        kind = int(chance.integers(4))
+        left = np.concatenate([np.zeros((1, row.shape[1]), int), row[:-1]])
+        guess = (0 * row, left, above, (left + above) // 2)[kind]
+        result += bytes([kind]) + ((row - guess) % 256).astype(np.uint8).tobytes()
+        above = row
+    return zlib.compress(result)
+
+
+@pytest.mark.parametrize(("color_type", "channels"), [(0, 1), (2, 3), (4, 2), (6, 4)])
+@pytest.mark.parametrize("transparent", [False, True])
+def test_sixteen_bits_are_rounded_to_eight(tmp_path: Path, color_type: int, channels: int, transparent: bool) -> None:
+    chance = np.random.default_rng(color_type)
+    values = chance.integers(0, 65536, (3, 4, channels))
+    values[0, 0] = 128  # rounded down from half a level; its upper byte is 0
+    values[0, 1] = 129  # rounded up
+    content = png(4, 3, 16, color_type, filtered(values.astype(">u2").view(np.uint8).reshape(3, 4, -1), chance))
+    has_alpha = channels in (2, 4)
+    if transparent and not has_alpha:
+        kept = content.index(b"IDAT") - 4
+        color = values[1, 2].astype(">u2").tobytes()
+        chunk = struct.pack(">I", len(color)) + b"tRNS" + color + struct.pack(">I", zlib.crc32(b"tRNS" + color))
+        content = content[:kept] + chunk + content[kept:]
+    path = tmp_path / "a.png"
+    path.write_bytes(content)
+    colors = values[..., :-1] if has_alpha else values
+    alpha = values[..., -1] if has_alpha else np.full((3, 4), 65535)
+    if transparent and not has_alpha:
+        alpha[1, 2] = 0
+    assert read_header(path) == (4, 3, has_alpha or transparent)
+    straight = np.concatenate([np.broadcast_to(colors, (3, 4, 3)), alpha[..., None]], -1)
+    eight = np.array([[[int(Fraction(int(v), 257) + Fraction(1, 2)) for v in p] for p in row] for row in straight])
+    np.testing.assert_array_equal(read(path), loop_area_average(eight.astype(np.uint8), 4, 3))
+    if not has_alpha and not transparent:
+        np.testing.assert_array_equal(read(path, 3), eight[..., :3])
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_images_are_turned_as_their_exif_data_say(tmp_path: Path, kind: str, orientation: int) -> None:
+    values = np.random.default_rng(0).integers(0, 256, (32, 48, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = save(Image.fromarray(values), tmp_path / f"a.{kind}", exif=exif)
+    with Image.open(path) as image:
+        stored, upright = np.asarray(image), np.asarray(ImageOps.exif_transpose(image))
+    height, width = upright.shape[:2]
+    assert read_header(path)[:2] == (width, height)
+    assert read_header(path, upright=False)[:2] == (48, 32)
+    turned = read_image(path, width=width, height=height, channels=3, size=(width, height))
+    np.testing.assert_array_equal(turned, upright)
+    kept = read_image(path, width=48, height=32, channels=3, size=(48, 32), upright=False)
+    np.testing.assert_array_equal(kept, stored)
+
+
+@pytest.mark.parametrize(
+    "exif", [b"", b"Exif\0\0", b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x02\0\0\0\x04abcd", b"\xff" * 40]
+)
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF data")
+def test_broken_exif_data_turn_nothing(tmp_path: Path, exif: bytes) -> None:
+    path = save(Image.new("RGB", (4, 3)), tmp_path / "a.jpg", exif=exif)
+    assert read_header(path) == (4, 3, False)
+    assert read(path, 3).shape == (3, 4, 3)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_masks_become_alpha(tmp_path: Path, mode: str) -> None:
+    chance = np.random.default_rng(1)
+    values = chance.integers(0, 256, (3, 4, len(mode)), dtype=np.uint8)
+    image = save(Image.fromarray(values), tmp_path / "a.png")
+    levels = chance.integers(0, 256, (3, 4), dtype=np.uint8)
+    mask = save(Image.fromarray(levels), tmp_path / "mask.png")
+    alpha = values[..., 3].astype(int) if mode == "RGBA" else 255
+    expected = np.concatenate(
+        [values[..., :3], np.rint(alpha * levels.astype(int) / 255)[..., None].astype(np.uint8)], -1
+    )
+    read_masked = partial(read_image, image, width=4, height=3, size=(4, 3), mask=mask)
+    np.testing.assert_array_equal(read_masked(channels=4), loop_area_average(expected, 4, 3))
+    with pytest.raises(ValueError, match=r"mask\.png: image must be opaque"):
+        read_masked(channels=3)
+    save(Image.new("1", (4, 3), 1), mask)
+    np.testing.assert_array_equal(read_masked(channels=4), read(image))
+
+
+def test_masks_are_averaged_to_their_images_and_of_other_shapes_refused(tmp_path: Path) -> None:
+    levels = np.random.default_rng(2).integers(0, 256, (6, 8), dtype=np.uint8)
+    path = save(Image.fromarray(levels), tmp_path / "mask.png")
+    expected = loop_area_average(np.repeat(levels[..., None], 3, -1), 4, 3)[..., 0]
+    np.testing.assert_array_equal(read_mask(path, (4, 3)), expected)
+    for size in [(16, 12), (8, 40)]:
+        with pytest.raises(ValueError, match=r"mask\.png: mask must be .* as its image, .* got 8 x 6"):
+            read_mask(path, size)
+    colored = save(Image.fromarray(np.array([[[0, 200, 0, 255], [255, 255, 255, 51]]], np.uint8)), tmp_path / "b.png")
+    assert read_mask(colored, (2, 1)).tolist() == [[200, 51]]
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -142,8 +242,6 @@ def png(width: int, height: int, depth: int = 8, color_type: int = 6, data: byte
         (png(100_000, 1), "at most 33554432 pixels and 16384 on a side, got 100000 x 1"),
         (png(8000, 8000), "at most 33554432 pixels and 16384 on a side, got 8000 x 8000"),
         (png(0, 0), "image"),
-        (png(4, 3, depth=16), "image must be of 8 bits per channel, got 16"),
-        (png(4, 3, depth=16, color_type=0), "image must be of 8 bits per channel, got 16"),
         (b"", "image must be a PNG or JPEG file"),
         (b"\x89PNG\r\n\x1a\n", "image"),
         (b"not an image at all, although it is long enough", "image must be a PNG or JPEG file"),

@@ -7,8 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from dnerf.data import BlenderData, DataSource, SyntheticData, save_blender
+from dnerf.data import DataSource, FolderData, SyntheticData, save_blender
 from dnerf.data.bounds import fit_box
+from dnerf.data.source import NoImages
 from dnerf.scenes import make_scene
 
 
@@ -24,11 +25,11 @@ def folder(tmp_path_factory):
     return root
 
 
-@pytest.fixture(params=["synthetic", "blender"])
+@pytest.fixture(params=["synthetic", "folder"])
 def make(request, folder):
     if request.param == "synthetic":
         return synthetic
-    return lambda **arguments: BlenderData(str(folder), None, **arguments)
+    return lambda **arguments: FolderData(folder, **arguments)
 
 
 def test_training_ends_where_it_is_told_to(make):
@@ -38,6 +39,7 @@ def test_training_ends_where_it_is_told_to(make):
     assert 0 < int(kept.sum()) < 11
     assert torch.equal(part.frames("train").times, whole.frames("train").times[kept])
     assert torch.equal(part.frames("train").images, whole.frames("train").images[kept])
+    assert torch.equal(part.record().cameras["train"].times, whole.frames("train").times[kept])
     for split in ("val", "test"):
         assert torch.equal(part.frames(split).times, whole.frames(split).times)
     # The first training frame has time 0.
@@ -50,17 +52,32 @@ def test_a_time_outside_the_film_is_refused(make, train_end):
         make(train_end=train_end)
 
 
-def test_a_given_box_stays_and_another_is_fitted_and_rounded_outwards(make):
-    box = [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
-    frames = make().frames("train")
-    assert make(box=box).fitted_box(frames) == box
+def test_a_record_holds_the_cameras_of_the_frames(make):
     source = make()
-    assert source.box is None
-    found, exact = torch.tensor(source.fitted_box(frames)), fit_box(frames)
+    record = source.record()
+    for split, cameras in record.cameras.items():
+        frames = source.frames(split)
+        assert torch.equal(cameras.poses, frames.poses)
+        assert torch.equal(cameras.times, frames.times)
+        assert cameras.intrinsics == frames.intrinsics
+
+
+def test_settled_sources_stand_where_they_are_told_to(make):
+    source, other = make(), make(box=[[-2.0, -2.0, -1.0], [1.0, 1.0, 2.0]])
+    source.settle(other.world())
+    assert source.world() == other.world()
+    assert torch.equal(source.frames("test").poses, other.frames("test").poses)
+
+
+def test_exact_scenes_keep_their_units_and_a_fitted_box_is_rounded_outwards():
+    box = [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
+    assert synthetic(box=box).world().box == ((-1.0, -2.0, -3.0), (1.0, 2.0, 3.0))
+    source = synthetic()
+    found, exact = torch.tensor(source.world().box), fit_box(source.frames("train"))
     assert (found[0] <= exact[0]).all()
     assert (found[1] >= exact[1]).all()
     torch.testing.assert_close(found, exact, rtol=0, atol=1.001e-3)  # four digits of about 3 units
-    assert [[round(x, 3) for x in corner] for corner in source.fitted_box(frames)] == source.fitted_box(frames)
+    assert source.world().similarity.scale == 1
 
 
 @pytest.mark.parametrize(
@@ -81,22 +98,54 @@ def opaque(image):
     return image
 
 
-@pytest.mark.parametrize("change", [opaque, lambda image: image.convert("RGB")])
-@pytest.mark.parametrize("split", ["val", "test"])
-def test_training_images_decide_for_all_splits_whether_there_is_alpha(folder, tmp_path, change, split):
+def test_an_alpha_channel_that_hides_nothing_is_none(folder, tmp_path):
     root = Path(shutil.copytree(folder, tmp_path / "scene"))
-    images_of(root, split, change)
-    assert (BlenderData(root, None).frames(split).images[..., 3] == 255).all()
     images_of(root, "train", opaque)
-    data = BlenderData(root, None)
-    assert not data.frames(split).has_alpha
+    data = FolderData(root)
     assert not data.frames("train").has_alpha
+    assert not data.world().has_alpha
 
 
-def test_transparent_images_are_refused_beside_opaque_training_images(folder, tmp_path):
+def test_opaque_test_images_beside_transparent_training_images_say_what_they_stand_before(folder, tmp_path):
     root = Path(shutil.copytree(folder, tmp_path / "scene"))
-    images_of(root, "train", opaque)
-    with pytest.raises(ValueError, match=r"test/r_000.png: image must be opaque, as the training images are"):
-        BlenderData(root, None).frames("test")
-    (root / "transforms_train.json").unlink()
-    assert BlenderData(root, None).frames("test").has_alpha
+    images_of(root, "test", lambda image: image.convert("RGB"))  # saved with black where nothing is
+    assert FolderData(root).frames("test").background == (0.0, 0.0, 0.0)
+    generator = torch.Generator().manual_seed(0)
+    for path in (root / "test").glob("*.png"):
+        Image.fromarray(torch.randint(0, 256, (8, 8, 3), generator=generator).byte().numpy()).save(path)
+    with pytest.raises(ValueError, match="cannot be compared"):
+        FolderData(root).frames("test")
+
+
+def test_splits_without_images_have_cameras_and_no_frames(folder, tmp_path):
+    root = Path(shutil.copytree(folder, tmp_path / "scene"))
+    shutil.rmtree(root / "test")
+    data = FolderData(root)
+    assert not data.cameras()["test"].have_images
+    with pytest.raises(NoImages, match="5 cameras of the test split have no images"):
+        data.frames("test")
+    (root / "transforms_test.json").unlink()
+    (root / "transforms_val.json").unlink()
+    assert len(FolderData(root).frames("test")) == 1
+    with pytest.raises(NoImages, match=r"data\.hold_out=8"):
+        FolderData(root, hold_out=None).check("test")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"near": -1.0}, "near must be >= 0"),
+        ({"near": 3.0, "far": 2.0}, "near must be less than far"),
+        ({"hold_out": 0}, "hold_out must be > 0"),
+        ({"times": "now"}, "times must be one of auto, order, static"),
+        ({"axes": "left"}, "axes must be one of"),
+        ({"format": "none"}, "format must be one of"),
+        ({"pixel_origin": "left"}, "pixel_origin must be one of"),
+        ({"resolution": 9}, "resolution must be at most the images' width 8"),
+        ({"box": [[9.0, 9, 9], [10, 10, 10]]}, "box must be seen by some camera|box lies elsewhere"),
+        ({"near": 50.0}, "near must be less than far, got 50"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(folder, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        FolderData(folder, **arguments).frames("train")

@@ -22,7 +22,7 @@ def camera_at(eye: tuple[float, float, float], *, pixel_origin: str = "center", 
 def seen(occupancy: Tensor, camera: Camera, backend: str, dtype: torch.dtype = torch.float32) -> Footprints | None:
     view = camera.intrinsics
     size = view.height, view.width
-    return under(backend, footprints, occupancy, AABB.to(dtype), camera.pose.to(dtype), view.lens, size)
+    return under(backend, footprints, occupancy, AABB.to(dtype), camera.pose.to(dtype), view.pinhole, size)
 
 
 def cells(share: float, seed: int, shape: tuple[int, ...] = (7, 5, 6)) -> Tensor:

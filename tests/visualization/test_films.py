@@ -14,6 +14,8 @@ from reference import FormulaField
 
 from dnerf import visualization as films
 from dnerf.core.cameras import Camera, Intrinsics, look_at
+from dnerf.data.normalization import Clock, Similarity, upright
+from dnerf.data.scene_record import World
 from dnerf.deformations import DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, TimeDependence
 from dnerf.rendering.renderer import Renderer
@@ -123,7 +125,7 @@ def test_planes_hold_the_whole_box_wherever_the_camera_is(tmp_path: Path, radius
     store = films.FrameStore(tmp_path, 3)
     views = films.make_views(poses, films.sweep_times(3), INTRINSICS, planes)
     films.render_frames_to(store, make_renderer(256), views, ["opacity"])
-    assert not films.is_empty(store)
+    assert films.empty_frames(store) == []
 
 
 def test_an_empty_film_is_noticed(tmp_path: Path) -> None:
@@ -131,7 +133,7 @@ def test_an_empty_film_is_noticed(tmp_path: Path) -> None:
     store = films.FrameStore(tmp_path, 2)
     views = films.make_views(away, [0.0, 1.0], INTRINSICS, films.box_planes(away, BOX))
     films.render_frames_to(store, make_renderer(), views, ["rgb"])
-    assert films.is_empty(store)
+    assert films.empty_frames(store) == [0, 1]
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -205,7 +207,7 @@ def test_raw_arrays_and_films_hold_every_frame(tmp_path: Path) -> None:
     films.render_frames_to(store, renderer, views, ["rgb", "depth"])
     (path,) = films.write_films(store, tmp_path / "film", ["rgb", "depth"], ["npz"], fps=12, views=views)
     with np.load(path) as arrays:
-        facts = {"fps", "times", "poses", "intrinsics", "pixel_origin"}
+        facts = {"fps", "times", "data_times", "poses", "intrinsics", "pixel_origin"}
         assert set(arrays.files) == {"rgb", "depth", "opacity", "max_opacity"} | facts
         assert arrays["pixel_origin"].tolist() == ["center"] * 3
         assert arrays["rgb"].shape == (3, 16, 20, 3)
@@ -216,6 +218,17 @@ def test_raw_arrays_and_films_hold_every_frame(tmp_path: Path) -> None:
             assert arrays["times"][i] == view.time
         focal = INTRINSICS.focal_x
         np.testing.assert_allclose(arrays["intrinsics"], [[20, 16, focal, focal, 10, 8]] * 3)
+    # In the data set's own units and clock, where there are such.
+    world = World(((-1.0,) * 3, (1.0,) * 3), Similarity(0.5, upright((0, 1, 0)), (1.0, 2.0, 3.0)), Clock(10.0, 4.0))
+    own = films.FrameStore(tmp_path / "own", 3)
+    films.render_frames_to(own, renderer, views, ["depth"], unit=0.5)
+    (path,) = films.write_films(own, tmp_path / "own", ["depth"], ["npz"], views=views, world=world)
+    with np.load(path) as arrays:
+        image = renderer.render_image(views[1].camera, views[1].time)
+        np.testing.assert_array_equal(arrays["depth"][1], image.depth / 0.5)
+        back = world.similarity.poses_to_world(torch.from_numpy(arrays["poses"][1]))
+        torch.testing.assert_close(back.float(), views[1].camera.pose)
+        assert arrays["data_times"][1] == pytest.approx(10 + 4 * views[1].time)
     (path,) = films.write_films(store, tmp_path / "film", ["depth"], ["mp4"], fps=10)
     assert path.name == "film.mp4"
     shape = iio.imread(path).shape

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dnerf.core.cameras import look_at
+from dnerf.data.normalization import Similarity, upright
 from dnerf.visualization import parse_key_frames, read_key_frames
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "keyframes.json"
@@ -106,3 +107,15 @@ def test_absurdly_long_films_and_an_eye_at_its_target_are_refused() -> None:
     frames = parse_key_frames(keys({"seconds": 0, "eye": [-2, 0, 0]}, {"seconds": 2, "eye": [2, 0, 0]}))
     with pytest.raises(ValueError, match="keyframes at 1 seconds: eye must differ from target"):
         frames.sample(4)
+
+
+def test_key_frames_in_a_data_set_s_units_show_the_same_from_the_world() -> None:
+    there = Similarity(0.25, upright((0, 1, 0)), (4.0, -2.0, 1.0))
+    keys = [{"seconds": 0, "eye": [8, 1, 2], "target": [4, -2, 1]}, {"seconds": 1, "eye": [0, 3, 5]}]
+    frames = parse_key_frames({"keyframes": keys})
+    poses = frames.in_world(there).sample(4)[0].double()
+    eyes = there.positions_from_world(poses[:, :3, 3])
+    torch.testing.assert_close(eyes, frames.sample(4)[0][:, :3, 3].double(), rtol=0, atol=1e-5)
+    around = parse_key_frames({"keyframes": [{"seconds": 0, "radius": 8}]}).in_world(there)
+    pose = around.sample(1, {"target": (0.0, 0.0, 1.0), "elevation": (0.0,)})[0][0]
+    torch.testing.assert_close(pose[:3, 3], torch.tensor([2.0, 0.0, 1.0]))

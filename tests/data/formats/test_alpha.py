@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dnerf.data.formats.blender import has_transparency, load_blender
+from dnerf.data.formats.legacy import has_transparency, load_blender
 
 Scene = Callable[..., Path]
 

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dnerf.core.cameras import Intrinsics, look_at
-from dnerf.data.formats.blender import load_blender, save_blender
+from dnerf.data.formats.legacy import load_blender
+from dnerf.data.formats.writers import save_blender
 from dnerf.data.frames import Frames
 from dnerf.data.images import premultiplied_area_average
 
@@ -60,7 +61,7 @@ def test_frames_are_read_premultiplied(make_scene: Scene) -> None:
     assert frames.times.tolist() == [0, 0.5, 1]
     assert frames.names == ("train/r_0", "train/r_1", "train/r_2")
     assert (frames.near, frames.far) == (2.0, 6.0)
-    assert frames.intrinsics == Intrinsics.from_angle(8, 6, 0.7)
+    assert frames.shared_intrinsics == Intrinsics.from_angle(8, 6, 0.7)
 
 
 @pytest.mark.parametrize(("resolution", "height"), [(8, 6), (4, 3), (5, 4), (3, 2), (1, 1)])
@@ -73,15 +74,15 @@ def test_resolution_is_a_width_with_height_and_focal_in_proportion(
     for i in range(3):
         expected = premultiplied_area_average(straight_pixels(root, i), resolution, height)
         np.testing.assert_array_equal(frames.images[i].numpy(), expected)
-    assert frames.intrinsics == Intrinsics.from_angle(8, 6, 0.7).resized(resolution, height)
+    assert frames.shared_intrinsics == Intrinsics.from_angle(8, 6, 0.7).resized(resolution, height)
 
 
 def test_arguments_come_before_the_file(make_scene: Scene) -> None:
     root = make_scene(lambda m: m.update(near=1, far=3, pixel_origin="corner"))
     frames = load_blender(root, "train")
-    assert (frames.near, frames.far, frames.intrinsics.pixel_origin) == (1, 3, "corner")
+    assert (frames.near, frames.far, frames.intrinsics[0].pixel_origin) == (1, 3, "corner")
     frames = load_blender(root, "train", near=0.25, far=9, pixel_origin="center")
-    assert (frames.near, frames.far, frames.intrinsics.pixel_origin) == (0.25, 9, "center")
+    assert (frames.near, frames.far, frames.intrinsics[0].pixel_origin) == (0.25, 9, "center")
 
 
 @pytest.mark.parametrize(
@@ -262,10 +263,10 @@ def test_real_scenes_have_the_published_facts(name: str, counts: tuple[int, int,
         assert (float(frames.times.min()), float(frames.times.max())) == (0, 1)
         assert (frames.times.diff() > 0).all()
         # 0.5 width / tan(0.5 * 0.6911112), known from NeRF's scenes as 1111.11 at 800
-        assert frames.intrinsics.focal_x * 20 == pytest.approx(1111.111, abs=1e-3)
+        assert frames.intrinsics[0].focal_x * 20 == pytest.approx(1111.111, abs=1e-3)
         rays = frames.camera(0).rays(0.0)
         # z-depths 2 and 6 are longer along slanted rays: the corner pixel's by 1 / cos
-        corner = math.sqrt(1 + 2 * (19.5 / frames.intrinsics.focal_x) ** 2)
+        corner = math.sqrt(1 + 2 * (19.5 / frames.intrinsics[0].focal_x) ** 2)
         assert float(rays.near[0]) == pytest.approx(2 * corner, rel=1e-6)
         assert float(rays.far[0]) == pytest.approx(6 * corner, rel=1e-6)
         # the cameras stand about 4 away and look at the scene near the origin

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from dnerf.data.formats.manifest import MAX_BYTES, read_manifest
+from dnerf.data.formats.old_manifest import MAX_BYTES, read_manifest
 
 Edit = Callable[[dict[str, Any]], object]
 Scene = Callable[..., Path]

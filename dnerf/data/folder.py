@@ -1,0 +1,188 @@
+"""A data set's folder, of whatever format: split, timed, placed in the world, read."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dnerf.core.cameras import PIXEL_OFFSETS, Intrinsics
+from dnerf.core.checks import check_choice, check_positive, check_whole
+from dnerf.data.background_check import border_color
+from dnerf.data.capture import Capture, CaptureFrame
+from dnerf.data.formats import read_capture
+from dnerf.data.frames import Frames
+from dnerf.data.loading import LoadedFrames, final_intrinsics, load_frames
+from dnerf.data.placing import Given, place, planes_between
+from dnerf.data.scene_record import CameraSet, World
+from dnerf.data.source import DataSource, NoImages, check_train_end, given_box
+from dnerf.data.splits import TIMES, SplitFrames, split_frames
+
+Z_UP = (0.0, 0.0, 1.0)
+
+
+class FolderData(DataSource):
+    """A data set in a folder.
+
+    Frames are in world units, see `dnerf.data.normalization`; what is given here is in the data set's own.
+
+    Args:
+        root: the folder.
+        resolution: width in pixels after area averaging; None keeps the files' own, at most 400.
+        box: (2, 3) corners of what is modelled; "auto" fits them to the training frames.
+        format: a reader of `dnerf.data.formats`; "auto" looks at what lies in the folder.
+        near: z-depth where rays begin; None finds it.
+        far: z-depth where they end; None finds it.
+        hold_out: every so many-th frame is the test split where the data set has none; None for no test split.
+        times: "auto" takes the files', "order" numbers the frames, "static" is one time for all.
+        axes: "opengl" or "opencv", of the cameras; "auto" takes the former and refuses cameras that look away.
+        pixel_origin: "center", or "corner" as D-NeRF's code; None takes what the file says, "center" if nothing.
+        train_end: train on frames up to this time in [0, 1] only, for extrapolation; None for all.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        resolution: int | None = None,
+        box: str | Sequence[Sequence[float]] = "auto",
+        *,
+        format: str = "auto",
+        near: float | None = None,
+        far: float | None = None,
+        hold_out: int | None = 8,
+        times: str = "auto",
+        axes: str = "auto",
+        pixel_origin: str | None = None,
+        train_end: float | None = None,
+    ) -> None:
+        check_train_end(train_end)
+        if not isinstance(root, str | Path):
+            raise ValueError(f"root must be a data set's folder, got {root!r}")
+        for name, plane in (("near", near), ("far", far)):
+            if plane is not None:
+                check_positive(name, plane, allow_zero=name == "near")
+        if near is not None and far is not None and near >= far:
+            raise ValueError(f"near must be less than far, got {near} and {far}")
+        for name, count in (("resolution", resolution), ("hold_out", hold_out)):
+            if count is not None:
+                check_whole(name, count)
+        if pixel_origin is not None:
+            check_choice("pixel_origin", pixel_origin, tuple(PIXEL_OFFSETS))
+        check_choice("times", times, TIMES)
+        self.root, self.resolution, self.train_end = Path(root), resolution, train_end
+        self.given = Given(given_box(box), near, far)
+        self.format, self.axes, self.pixel_origin = format, axes, pixel_origin
+        self.hold_out, self.times = hold_out, times
+        self._world: World | None = None
+        self._train: LoadedFrames | None = None
+
+    @cached_property
+    def capture(self) -> Capture:
+        """What the folder's files say; ValueError as `read_capture`."""
+        return read_capture(self.root, self.format, axes=self.axes)
+
+    @cached_property
+    def _split(self) -> SplitFrames:
+        return split_frames(self.capture, self.hold_out, self.times)
+
+    def frames(self, split: str) -> Frames:
+        """Read a split; ValueError for what can be wrong with its files, or if it has no images."""
+        self.check(split)
+        world = self.world()
+        loaded = self._train if split == "train" and self._train is not None else self._load(split)
+        self._train = None
+        poses = world.similarity.poses_to_world(_poses(loaded.frames)).float()
+        frames = self._made(loaded, poses, planes_between(poses, world))
+        if world.has_alpha and not frames.has_alpha and frames.background is None:
+            frames = self._on_its_background(frames, split)
+        return self._known(frames, split)
+
+    def world(self) -> World:
+        """How the training frames are placed in the world: as settled, or found from them."""
+        if self._world is None:
+            self._train = self._load("train")
+            self._world = self._placed(self._train)
+        return self._world
+
+    def settle(self, world: World) -> None:
+        """See `DataSource.settle`."""
+        self._world = world
+
+    def cameras(self) -> dict[str, CameraSet]:
+        """See `DataSource.cameras`: of every split, with images or without."""
+        similarity, result = self.world().similarity, {}
+        for split, frames in self._split.splits.items():
+            have_images = any(frame.image is not None for frame in frames)
+            kept = [frame for frame in frames if split != "train" or self._is_learnt(frame)]
+            shared: dict[Intrinsics, Intrinsics] = {}
+            lenses = (self._lens(final_intrinsics(frame, self.resolution)) for frame in kept)
+            result[split] = CameraSet(
+                similarity.poses_to_world(_poses(kept)).float(), _times(kept),
+                tuple(shared.setdefault(lens, lens) for lens in lenses), tuple(frame.name for frame in kept),
+                have_images,
+            )  # fmt: skip
+        return result
+
+    def check(self, split: str) -> None:
+        """Read the files that say where images and cameras are, see `DataSource.check`."""
+        super().check(split)
+        splits = self._split.splits
+        if split not in splits:
+            raise NoImages(
+                f"{self.capture.path}: there is no {split} split, only {', '.join(splits)}; data.hold_out=8 makes a "
+                "test split of every eighth training frame, evaluate_split=null scores none"
+            )
+        if not any(frame.image is not None for frame in splits[split]):
+            raise NoImages(
+                f"{self.capture.path}: the {len(splits[split])} cameras of the {split} split have no images: they can "
+                "be filmed (render.py path=test), not scored; evaluate_split=null scores none"
+            )
+
+    def _is_learnt(self, frame: CaptureFrame) -> bool:
+        has_image = frame.image is not None and frame.image.path.exists()
+        return has_image and (self.train_end is None or bool(_times([frame])[0] <= self.train_end))
+
+    def _load(self, split: str) -> LoadedFrames:
+        frames = [frame for frame in self._split.splits[split] if frame.image is not None]
+        return load_frames(frames, resolution=self.resolution)
+
+    def _placed(self, loaded: LoadedFrames) -> World:
+        stated = self.capture.up
+        if stated is None and self.capture.format == "blender":
+            stated = Z_UP  # Blender's, where cameras do not say otherwise
+        given = replace(self.given, up=stated, planes=self.capture.planes, points=self.capture.points)
+        world = place(
+            lambda poses, planes: self._made(loaded, poses, planes), _poses(loaded.frames), loaded.intrinsics, given
+        )
+        notes = (*self.capture.notes, *self._split.notes, *loaded.notes, *world.notes)
+        return replace(world, clock=self._split.clock, has_alpha=loaded.has_alpha, notes=notes)
+
+    def _made(self, loaded: LoadedFrames, poses: Tensor, planes: tuple[float, float]) -> Frames:
+        background = None if loaded.has_alpha else self.capture.background
+        lenses = [self._lens(lens) for lens in loaded.intrinsics]
+        names = tuple(frame.name for frame in loaded.frames)
+        return Frames(loaded.images, poses, _times(loaded.frames), lenses, *planes, background, names)
+
+    def _lens(self, intrinsics: Intrinsics) -> Intrinsics:
+        return intrinsics if self.pixel_origin is None else replace(intrinsics, pixel_origin=self.pixel_origin)
+
+    def _on_its_background(self, frames: Frames, split: str) -> Frames:
+        """Opaque frames of a data set whose training images have alpha: what they stand before must be plain."""
+        color = border_color(frames)
+        if color is None:
+            raise ValueError(
+                f"{self.capture.path}: images of the {split} split are opaque and show something everywhere, training "
+                "images are transparent: they cannot be compared; export both alike"
+            )
+        red, green, blue = color.tolist()
+        return replace(frames, background=(red, green, blue))
+
+
+def _poses(frames: Sequence[CaptureFrame]) -> Tensor:
+    return torch.tensor([frame.pose for frame in frames], dtype=torch.float64)
+
+
+def _times(frames: Sequence[CaptureFrame]) -> Tensor:
+    return torch.tensor([frame.time for frame in frames], dtype=torch.float32)

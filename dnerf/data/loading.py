@@ -1,0 +1,246 @@
+"""The frames of a capture to pixels in memory, and their intrinsics at the size of those pixels."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dnerf.core.cameras import Intrinsics
+from dnerf.core.checks import check_whole
+from dnerf.data.capture import CaptureFrame
+from dnerf.data.images import MAX_PIXELS, Bytes, finish_image, has_shape, is_transparent, read_header, read_image
+from dnerf.data.pixel_store import MAX_MEMORY, empty_pixels
+from dnerf.data.videos import read_frames, video_size
+
+DEFAULT_WIDTH = 400  # in pixels, unless told: D-NeRF's protocol
+MISSING = 10  # of so many images, fewer than one may be missing
+NAMED = 8  # images that a note names
+MAX_THREADS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedFrames:
+    """Frames whose images are there, and their pixels."""
+
+    frames: tuple[CaptureFrame, ...]  # with intrinsics at the size of the pixels
+    images: Tensor  # see `Frames.images`
+    notes: tuple[str, ...]  # what was repaired, a line each
+
+    @property
+    def intrinsics(self) -> tuple[Intrinsics, ...]:
+        """Of each frame."""
+        return tuple(frame.intrinsics for frame in self.frames)
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the images have an alpha channel and so premultiplied colour."""
+        return self.images.shape[-1] == 4
+
+
+@dataclass(frozen=True)
+class _Header:
+    """How one frame's image is read."""
+
+    frame: CaptureFrame  # with intrinsics at the final size
+    path: Path
+    number: int | None  # in a video, from 0; None for an image file
+    size: tuple[int, int]  # width and height, decoded
+    may_have_alpha: bool = False
+    is_upright: bool = True  # turned as its EXIF data say
+    stated: tuple[int, int] | None = None  # width and height of the file's intrinsics, if the image has others
+
+
+def load_frames(
+    frames: Sequence[CaptureFrame],
+    *,
+    resolution: int | None = None,
+    has_alpha: bool | None = None,
+    max_memory: int = MAX_MEMORY,
+) -> LoadedFrames:
+    """Decode the images of frames, with their masks as alpha, and reduce them to a width.
+
+    Images are decoded, premultiplied, averaged over pixel areas and rounded one at a time in each of up to four
+    threads, so memory is that of the result and a few images. Videos are decoded once, from their first frame.
+
+    Args:
+        frames: each with an image.
+        resolution: width in pixels to reduce to, height in proportion; narrower images stay as they are. The files'
+            own, at most 400, if None.
+        has_alpha: whether images have an alpha channel. None decides: if there are masks, or any pixel is not opaque,
+            whatever the files' headers say. Splits of one data set should agree.
+        max_memory: bytes of pixels beyond which they lie in a temporary file, see `empty_pixels`.
+
+    Raises:
+        ValueError: in one line that names the file, for images that are broken, too large, or of another shape than
+            their intrinsics; for transparent pixels where `has_alpha` is False; where a tenth of the images or more are
+            missing; if `resolution` is wider than all images.
+    """
+    if not frames:
+        raise ValueError("frames must hold at least one, got none")
+    present, notes = _present(frames)
+    headers = [_header(frame, resolution) for frame in present]
+    widest = max(header.size[0] for header in headers)
+    if resolution is not None and resolution > widest:
+        raise ValueError(
+            f"resolution must be at most the images' width {widest}, or null for that, got {resolution}: "
+            f"{headers[0].path}"
+        )
+    notes += _scaled_notes(headers)
+    if has_alpha is None:
+        masked = any(header.frame.mask is not None for header in headers)
+        has_alpha = masked or any(is_transparent(header.path) for header in headers if header.may_have_alpha)
+    images, parts = _room([header.frame.intrinsics for header in headers], 4 if has_alpha else 3, max_memory)
+    tasks = [_task(headers, indices, parts) for indices in _by_file(headers)]
+    largest = max(header.size[0] * header.size[1] for header in headers)
+    _in_threads(tasks, min(MAX_THREADS, max(1, MAX_PIXELS // largest)))
+    return LoadedFrames(tuple(header.frame for header in headers), images, notes)
+
+
+def final_intrinsics(frame: CaptureFrame, resolution: int | None = None) -> Intrinsics:
+    """The intrinsics that `load_frames` would give a frame, by its image's header; the stated size without an image."""
+    if frame.image is None or not frame.image.path.exists():
+        return _reduced(frame.intrinsics, resolution)
+    return _header(frame, resolution).frame.intrinsics
+
+
+def _present(frames: Sequence[CaptureFrame]) -> tuple[list[CaptureFrame], tuple[str, ...]]:
+    """The frames whose images are there, and a note that names others."""
+    present: list[CaptureFrame] = []
+    missing: list[CaptureFrame] = []
+    for frame in frames:
+        if frame.image is None:
+            raise ValueError(f"frames must have images, {frame.name} has none")
+        (present if frame.image.path.exists() else missing).append(frame)
+    if not missing:
+        return present, ()
+    paths = [str(frame.image.path) for frame in missing if frame.image is not None]
+    if MISSING * len(missing) >= len(frames):
+        raise ValueError(
+            f"{paths[0]}: image does not exist, nor do {len(missing) - 1} others of {len(frames)}: add them, or take "
+            f"their frames out of the file; fewer than one in {MISSING} may be missing"
+        )
+    rest = "" if len(missing) <= NAMED else f" and {len(missing) - NAMED} more"
+    return present, (f"{len(missing)} of {len(frames)} images are missing, left out: {', '.join(paths[:NAMED])}{rest}",)
+
+
+def _header(frame: CaptureFrame, resolution: int | None) -> _Header:
+    """An image's size, and its frame with the intrinsics at the size to which it is to be reduced."""
+    assert frame.image is not None
+    path, number, intrinsics = frame.image.path, frame.image.frame, frame.intrinsics
+    is_upright, may_have_alpha = True, False
+    if number is not None:
+        size = video_size(path)
+    else:
+        width, height, may_have_alpha = read_header(path)
+        size = (width, height)
+        stored = read_header(path, upright=False)[:2]
+        # Some programs work with images as they are stored; their intrinsics tell.
+        if stored != size and stored == (intrinsics.width, intrinsics.height):
+            size, is_upright = stored, False
+    stated = (intrinsics.width, intrinsics.height)
+    if stated == size:
+        return _Header(_with(frame, _reduced(intrinsics, resolution)), path, number, size, may_have_alpha, is_upright)
+    if not has_shape(stated, size):
+        raise ValueError(
+            f"{path}: image must have the shape of its intrinsics, {stated[0]} x {stated[1]}, got {size[0]} x "
+            f"{size[1]}: correct the file's width, height, focal lengths and principal point, or crop the image"
+        )
+    intrinsics = _reduced(intrinsics.resized(*size), resolution)
+    return _Header(_with(frame, intrinsics), path, number, size, may_have_alpha, is_upright, stated)
+
+
+def _with(frame: CaptureFrame, intrinsics: Intrinsics) -> CaptureFrame:
+    return frame if intrinsics == frame.intrinsics else replace(frame, intrinsics=intrinsics)
+
+
+def _reduced(intrinsics: Intrinsics, resolution: int | None) -> Intrinsics:
+    if resolution is not None:
+        check_whole("resolution", resolution)
+    width = min(int(resolution or DEFAULT_WIDTH), intrinsics.width)
+    if width == intrinsics.width:
+        return intrinsics
+    return intrinsics.resized(width, max(1, round(intrinsics.height * width / intrinsics.width)))
+
+
+def _scaled_notes(headers: Sequence[_Header]) -> tuple[str, ...]:
+    scaled = [header for header in headers if header.stated is not None]
+    notes = []
+    if scaled:
+        first = scaled[0]
+        assert first.stated is not None
+        notes.append(
+            f"intrinsics of {first.stated[0]} x {first.stated[1]} are scaled to images of {first.size[0]} x "
+            f"{first.size[1]}, of {len(scaled)} frames: {first.path}"
+        )
+    if turned := [header for header in headers if not header.is_upright]:
+        notes.append(
+            f"{len(turned)} images are taken as they are stored, for their intrinsics have that size, not upright as "
+            f"their EXIF data say: {turned[0].path}"
+        )
+    return tuple(notes)
+
+
+def _room(intrinsics: Sequence[Intrinsics], channels: int, max_memory: int) -> tuple[Tensor, list[Tensor]]:
+    """Pixels of all frames, as in `Frames.images`, and views (H, W, C) of each."""
+    sizes = [(lens.height, lens.width) for lens in intrinsics]
+    if len(set(sizes)) == 1:
+        images = empty_pixels((len(sizes), *sizes[0], channels), max_memory)
+        return images, list(images)
+    images = empty_pixels((sum(height * width for height, width in sizes), channels), max_memory)
+    parts = images.split([height * width for height, width in sizes])
+    return images, [part.view(*size, channels) for part, size in zip(parts, sizes)]
+
+
+def _by_file(headers: Sequence[_Header]) -> list[list[int]]:
+    """Frames of one video together, in one list; an image alone."""
+    videos: dict[Path, list[int]] = {}
+    for index, header in enumerate(headers):
+        if header.number is not None:
+            videos.setdefault(header.path, []).append(index)
+    return [[index] for index, header in enumerate(headers) if header.number is None] + list(videos.values())
+
+
+def _task(headers: Sequence[_Header], indices: Sequence[int], parts: Sequence[Tensor]) -> Callable[[], None]:
+    """What fills the parts with the pixels of one file."""
+
+    def image() -> None:
+        (index,) = indices
+        read = partial(read_image, headers[index].path, upright=headers[index].is_upright)
+        _fill(headers[index], parts[index], read)
+
+    def video() -> None:
+        path = headers[indices[0]].path
+        wanted: dict[int, list[int]] = {}
+        for index in indices:
+            wanted.setdefault(headers[index].number or 0, []).append(index)
+        number = -1
+        for number, pixels in enumerate(read_frames(path)):
+            for index in wanted.pop(number, ()):
+                _fill(headers[index], parts[index], partial(finish_image, pixels, path))
+            if not wanted:
+                return
+        raise ValueError(f"{path}: video must have the frame {min(wanted)}, counted from 0, got {number + 1} frames")
+
+    return image if headers[indices[0]].number is None else video
+
+
+def _fill(header: _Header, part: Tensor, read: Callable[..., Bytes]) -> None:
+    height, width, channels = part.shape
+    pixels = read(width=width, height=height, channels=channels, size=header.size, mask=header.frame.mask)
+    part.copy_(torch.from_numpy(pixels))
+
+
+def _in_threads(tasks: Sequence[Callable[[], None]], num_threads: int) -> None:
+    """Do tasks in threads; the first failure in their order is raised, the rest cancelled."""
+    with ThreadPoolExecutor(num_threads) as pool:
+        futures = [pool.submit(task) for task in tasks]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
