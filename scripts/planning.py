@@ -10,7 +10,7 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_app import build, resolved
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dnerf.data.frames import Frames
 from dnerf.planning import Part, Plan, make_plan
@@ -74,7 +74,8 @@ def composed(parts: Mapping[str, Part], choices: Mapping[str, str], task: Sequen
     chosen = [override for name, part in parts.items() for override in part.candidates[choices[name]]]
     mine = {_key(override) for override in task}
     config = compose("train", [*(x for x in chosen if _key(x) not in mine), *task])
-    config.pop("plan", None)
+    with open_dict(config):
+        config.pop("plan", None)
     return config
 
 

@@ -15,7 +15,8 @@ from dnerf.training.run import Run
 
 logger = logging.getLogger(__name__)
 
-LEAST_STEPS = 8  # of a trial: fewer tell nothing
+LEAST_STEPS = 16  # of a trial: fewer tell nothing
+LEAST_DONE = 64  # steps of a model before its parts are tried: what helps a fresh one may not help for long
 MOST_STEPS = 400  # more tell nothing new
 
 
@@ -107,7 +108,7 @@ class _Planner:
         part, choices = self.parts[name], self._choices()
         leading = self._leading(learnt, choices, part.at)
         effort = self._effort(leading, len(part.candidates) - 1, num_left)
-        if effort.num_steps < LEAST_STEPS:
+        if effort.num_steps < LEAST_STEPS or leading.run.step < LEAST_DONE:
             self.decisions[name] = self._untried(name, "the budget is too small to try")
             return
         standing = self.standing[name].choice

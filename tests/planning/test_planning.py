@@ -78,7 +78,7 @@ def make(choices: Mapping[str, str]) -> tuple[Renderer, Trainer]:
     """A model that learns at two rates."""
     rates = {"slow": 1e-6, "quick": 2e-2, "worse": 1e-7}
     settings = AdamSettings({"default": rates[choices.get("rate", "slow")]})
-    return small_renderer(), small_trainer(num_steps=200, num_rays=64, optimizer=settings)
+    return small_renderer(), small_trainer(num_steps=800, num_rays=64, optimizer=settings)
 
 
 def test_fork_continues_from_the_same_weights_and_moments() -> None:
@@ -114,14 +114,14 @@ def part(**changes: object) -> Part:
 
 
 def test_trial_decides_and_its_winner_is_trained_on() -> None:
-    plan, run = make_plan({"rate": part()}, {}, make, small_frames(24), share=0.3)
+    plan, run = make_plan({"rate": part()}, {}, make, small_frames(24), share=0.05)
     decision = plan.decisions["rate"]
     assert (decision.choice, decision.by) == ("quick", "trial")
     assert run is not None
-    assert run.step >= 20 + LEAST_STEPS
+    assert run.step >= 80 + LEAST_STEPS
     renderer, trainer = make(plan.choices)
     record = trainer.fit(run.renderer, small_frames(24), begun=run)
-    assert record.step == 200
+    assert record.step == 800
     assert run.renderer is not renderer
 
 
