@@ -100,7 +100,7 @@ class Folder:
             return None
         suffix = next((s for s in IMAGE_SUFFIXES if name.endswith(s)), "")
         stem = name.removesuffix(suffix)
-        for candidate in [name] * bool(suffix) + [name + s for s in IMAGE_SUFFIXES]:
+        for candidate in [name, *(name + s for s in IMAGE_SUFFIXES)]:
             if os.path.isfile(self.root / candidate):
                 return self.inside(self.root / candidate, where)
         for other in IMAGE_SUFFIXES if suffix else ():

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dnerf.data.formats import read_capture
-from dnerf.data.formats.axes import common_focus, looks_away
+from dnerf.data.formats.axes import common_focus, looks_away, looks_inverted
 
 
 def ring(count: int, *, outwards: bool = False, spread: float = math.tau, radius: float = 4.0) -> np.ndarray:
@@ -66,6 +66,24 @@ def test_a_walk_that_looks_around_has_no_common_focus() -> None:
     poses = ring(200, outwards=True)
     poses[:, :3, 3] = generator.uniform(-5, 5, (200, 3))
     assert not looks_away(poses)
+
+
+@given(st.integers(0, 2**31), st.booleans())
+def test_matrices_from_world_to_camera_are_recognised(seed: int, opencv: bool) -> None:
+    """Around a subject that is not far from the origin, as they are exported."""
+    generator = np.random.default_rng(seed)
+    poses = ring(int(generator.integers(6, 30)))
+    poses[:, :3, 3] += generator.uniform(-1, 1, 3) - [5, -3, 100]
+    assert not looks_inverted(poses)
+    assert looks_inverted(np.linalg.inv(poses @ FLIP if opencv else poses))
+
+
+def test_walks_and_pans_are_not_taken_for_inverses() -> None:
+    generator = np.random.default_rng(1)
+    for _ in range(50):
+        poses = ring(40, outwards=True)
+        poses[:, :3, 3] = generator.uniform(-5, 5, (40, 3)) + generator.uniform(-20, 20, 3)
+        assert not looks_inverted(poses)
 
 
 def test_sparse_points_decide_before_the_focus() -> None:

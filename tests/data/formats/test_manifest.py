@@ -223,6 +223,13 @@ def test_a_dot_in_a_name_is_no_suffix_and_utf8_with_a_byte_order_mark_is_read(ro
         path.write_text(path.read_bytes()[3:].decode().replace(name, "0001.png"))
 
 
+def test_images_of_another_kind_are_named_as_such(root: Path) -> None:
+    (root / "train/0001.png").rename(root / "train/0001.webp")
+    (root / "train/0001.webp").write_bytes(b"RIFF____WEBP")
+    with pytest.raises(ValueError, match=r"train/0001.webp: image must be a PNG or JPEG file"):
+        read_capture(edited(root, frame(file_path="train/0001.webp")))
+
+
 def test_images_that_were_reduced_are_found_in_their_folder(tmp_path: Path) -> None:
     root = data_folders.write_transforms(tmp_path / "scene")
     (root / "images").rename(root / "images_4")
@@ -338,7 +345,9 @@ def test_a_frames_own_coefficients_come_before_the_files(root: Path) -> None:
     [
         ({"camera_angle_x": ...}, "camera_angle_x, fl_x or K must be given, got none; add the"),
         ({"camera_angle_x": math.nan}, "camera_angle_x must be a number in .* got nan"),
-        ({"camera_angle_x": 3.15}, "camera_angle_x must be a number in .* got 3.15"),
+        ({"camera_angle_x": 39.6}, "camera_angle_x must be in radians, below pi, got 39.6; that may be 0.69115"),
+        ({"camera_angle_x": 400}, "camera_angle_x must be a number in .* got 400"),
+        ({"fl_x": 0.3}, "fl_x must be in pixels of images 8 across, got 0.3; multiply it by 8 if it is a share"),
         ({"fl_x": -9}, "fl_x must be a number in .* got -9"),
         ({"fl_x": 9, "fl_y": 0}, "fl_y must be a number in .* got 0"),
         ({"cx": math.nan}, "cx must be a number in .* got nan"),
