@@ -78,7 +78,7 @@ def write_transforms(root: Path) -> Path:
 
 
 def write_nerfies(root: Path) -> Path:
-    """With scene coordinates of another scale, and images of half the size that cameras mean."""
+    """With planes in scene coordinates of another scale."""
     ids = [f"{index:06d}" for index in range(NUM_FRAMES)]
     for index, (name, pose) in enumerate(zip(ids, poses())):
         write_image(root / f"rgb/2x/{name}.png", index)

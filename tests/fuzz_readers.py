@@ -33,9 +33,9 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "scripts")]
 import data_folders  # noqa: E402
 from small_runs import run_of, small_renderer  # noqa: E402
 
-from dnerf.data import load_blender  # noqa: E402
 from dnerf.data.capture import Capture  # noqa: E402
 from dnerf.data.formats import read_capture  # noqa: E402
+from dnerf.data.loading import load_frames  # noqa: E402
 from dnerf.training.checkpoint import encode_run, max_bytes, restore_run  # noqa: E402
 from dnerf.training.checkpoint_folder import CheckpointFolder  # noqa: E402
 from dnerf.training.runs import load_config  # noqa: E402
@@ -131,42 +131,6 @@ def mutate_png(data: bytes, chance: random.Random) -> bytes:
     return data[:8] + b"".join(packed)
 
 
-def data_set(folder: Path) -> Reader:
-    """A small scene, one of whose files is spoilt at a time."""
-    (folder / "train").mkdir(parents=True)
-    pose = [[1.0, 0, 0, 0.5], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1.0]]
-    names = ["./train/r_0", "train/r_1.png", "train/r_2.jpg"]
-    frames = [{"file_path": n, "time": i / 2, "transform_matrix": pose} for i, n in enumerate(names)]
-    manifest = {"camera_angle_x": 0.7, "frames": frames}
-    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 4), dtype=np.uint8)
-    for index in (0, 1):
-        Image.fromarray(pixels).save(folder / "train" / f"r_{index}.png")
-    Image.fromarray(pixels[..., :3]).save(folder / "train" / "r_2.jpg")
-    listed = folder / "transforms_train.json"
-    listed.write_text(json.dumps(manifest))
-    originals = {path: path.read_bytes() for path in (listed, *sorted((folder / "train").iterdir()))}
-
-    def read(chance: random.Random) -> None:
-        path = chance.choice([listed, *originals])
-        data = spoilt = originals[path]
-        if path == listed and chance.random() < 0.7:
-            value = manifest
-            for _ in range(chance.choice([1, 1, 2])):
-                value = mutate_json(value, chance)
-            spoilt = json.dumps(value).encode()
-        elif path.suffix == ".png" and chance.random() < 0.6:
-            spoilt = mutate_png(data, chance)
-        else:
-            spoilt = mutate_bytes(data, chance)
-        path.write_bytes(spoilt)
-        try:
-            assert load_blender(folder, "train", chance.choice([None, 4])).images.dtype == torch.uint8
-        finally:
-            path.write_bytes(data)
-
-    return read
-
-
 def check_capture(capture: Capture, root: Path) -> None:
     """What everything that follows relies on, of a reader's answer to any input."""
     inside = os.path.realpath(root)
@@ -205,41 +169,57 @@ def mutate_binary(data: bytes, chance: random.Random) -> bytes:
     return bytes(result)
 
 
-def folder_of(write: Callable[[Path], object], read_too: Callable[[Capture], object]) -> Callable[[Path], Reader]:
-    """A reader's folder, one of whose files is spoilt at a time, mostly one that is no image."""
+def folder_of(write: Callable[[Path], object], *, decode: bool = True) -> Callable[[Path], Reader]:
+    """A reader of a folder, one of whose files is spoilt at a time; and of its images, where `decode` says so."""
 
     def make(folder: Path) -> Reader:
         root = folder / "scene"
         write(root)
         originals = {path: path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
-        images = [path for path in originals if path.suffix == ".png"]
-        others = [path for path in originals if path.suffix not in (".png", ".mp4")]
+        images = [path for path in originals if path.suffix in (".png", ".jpg")]
+        others = [path for path in originals if path not in images and path.suffix != ".mp4"]
 
         def read(chance: random.Random) -> None:
-            path = chance.choice(images if images and chance.random() < 0.1 else others)
-            data = spoilt = originals[path]
-            if path.suffix == ".json" and chance.random() < 0.75:
-                value = json.loads(data)
-                for _ in range(chance.choice([1, 1, 2])):
-                    value = mutate_json(value, chance)
-                spoilt = json.dumps(value).encode()
-            elif path.suffix == ".png":
-                spoilt = mutate_png(data, chance)
-            elif path.suffix in (".bin", ".npy", ".ply"):
-                spoilt = mutate_binary(data, chance)
-            else:
-                spoilt = mutate_bytes(data, chance)
-            path.write_bytes(spoilt)
+            path = chance.choice(images if images and chance.random() < 0.3 else others)
+            data = originals[path]
+            path.write_bytes(spoilt(path, data, chance))
             try:
                 capture = read_capture(root, axes=chance.choice(["auto", "opengl"]))
                 check_capture(capture, root)
-                read_too(capture)
+                for frames in capture.splits.values() if decode else ():
+                    load_frames([frame for frame in frames if frame.image], resolution=chance.choice([None, 4]))
             finally:
                 path.write_bytes(data)
 
         return read
 
     return make
+
+
+def spoilt(path: Path, data: bytes, chance: random.Random) -> bytes:
+    """A file's bytes, changed in a way that its kind invites."""
+    if path.suffix == ".json" and chance.random() < 0.75:
+        value = json.loads(data)
+        for _ in range(chance.choice([1, 1, 2])):
+            value = mutate_json(value, chance)
+        return json.dumps(value).encode()
+    if path.suffix == ".png" and chance.random() < 0.6:
+        return mutate_png(data, chance)
+    if path.suffix in (".bin", ".npy", ".ply"):
+        return mutate_binary(data, chance)
+    return mutate_bytes(data, chance)
+
+
+def write_blender(root: Path) -> None:
+    """With a JPEG, a name without suffix, a mask and a test split."""
+    data_folders.write_blender(root)
+    fields = json.loads((root / "transforms_train.json").read_text())
+    Image.open(root / "train/0002.png").convert("RGB").save(root / "train/0002.jpg")
+    fields["frames"][2]["file_path"] = "train/0002.jpg"
+    fields["frames"][1]["file_path"] = "./train/0001"
+    fields["frames"][0]["mask_path"] = "train/0003.png"
+    (root / "transforms_train.json").write_text(json.dumps(fields))
+    (root / "transforms_test.json").write_text(json.dumps({**fields, "frames": fields["frames"][:2]}))
 
 
 def write_transforms(root: Path) -> None:
@@ -341,14 +321,12 @@ def config(folder: Path) -> Reader:
     return read
 
 
-WRITERS = {
-    "blender": data_folders.write_blender, "transforms": write_transforms, "nerfies": write_nerfies,
-    "llff": data_folders.write_llff, "rig": data_folders.write_rig, "colmap": data_folders.write_colmap,
-    "colmap text": partial(data_folders.write_colmap, binary=False),
-}  # fmt: skip
 READERS = {
-    "data set": data_set, "checkpoint": checkpoint, "config": config,
-    **{name: folder_of(write, lambda capture: None) for name, write in WRITERS.items()},
+    "checkpoint": checkpoint, "config": config, "blender": folder_of(write_blender),
+    "transforms": folder_of(write_transforms), "nerfies": folder_of(write_nerfies),
+    "llff": folder_of(data_folders.write_llff), "rig": folder_of(data_folders.write_rig, decode=False),
+    "colmap": folder_of(data_folders.write_colmap),
+    "colmap text": folder_of(partial(data_folders.write_colmap, binary=False)),
 }  # fmt: skip
 
 

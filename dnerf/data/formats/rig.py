@@ -12,6 +12,7 @@ from dnerf.data.formats.keys import LENS_KEYS
 from dnerf.data.formats.manifest import color, unique
 from dnerf.data.formats.manifest_cameras import MAX_SIDE, LensFields
 from dnerf.data.formats.poses import from_opencv, rigid_pose
+from dnerf.data.videos import read_video_header
 
 SPLITS = {"train": "train_videos", "test": "test_videos"}
 KNOWN = LENS_KEYS | {
@@ -77,8 +78,6 @@ def _frames(
         raise ValueError(f"{where}.file_name: no video {path}; put it there, or remove it from the list")
     stated = [video.get(key) for key in ("frame_num", "frame_rate", "camera_hw")]
     if None in stated:
-        from dnerf.data.videos import read_video_header
-
         header = read_video_header(path)
         stated = [
             found if value is None else value

@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 import data_folders
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 from data_folders import NUM_FRAMES, llff_rows
@@ -48,6 +49,24 @@ def test_cameras_may_have_a_folder_each(tmp_path: Path, folder: str) -> None:
     assert [frame.time for frame in frames] == [0, 10, 20] * NUM_FRAMES
     np.testing.assert_allclose([frame.pose for frame in frames[::3]], data_folders.poses(), atol=1e-12)
     assert len({frame.name for frame in frames}) == 3 * NUM_FRAMES
+
+
+def test_cameras_may_have_a_video_each(tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    root.mkdir()
+    for camera in range(NUM_FRAMES):
+        with imageio.get_writer(root / f"cam{camera:02d}.mp4", fps=30) as writer:
+            for moment in range(5):
+                writer.append_data(np.full((16, 16, 3), 40 * moment, np.uint8))
+    np.save(root / "poses_bounds.npy", llff_rows())
+    frames = read_capture(root).splits["all"]
+    assert [frame.time for frame in frames] == [0, 1, 2, 3, 4] * NUM_FRAMES
+    assert [frame.image.frame for frame in frames if frame.image] == [0, 1, 2, 3, 4] * NUM_FRAMES
+    assert [frames[0].name, frames[9].name] == ["cam00/00000", "cam01/00004"]
+    np.testing.assert_allclose([frame.pose for frame in frames[::5]], data_folders.poses(), atol=1e-12)
+    (root / "cam02.mp4").write_bytes(b"#EXTM3U\n/etc/passwd\n")
+    with pytest.raises(ValueError, match=r"cam02.mp4: video cannot be decoded"):
+        read_capture(root)
 
 
 def test_names_without_numbers_give_no_time_and_reduced_images_are_found(root: Path) -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import data_folders
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 
@@ -70,3 +71,18 @@ def test_bad_fields_are_named_in_one_line(root: Path, edit: Callable, message: s
 def test_unknown_keys_get_a_note(root: Path) -> None:
     notes = read_capture(edited(root, lambda f: f.update(weather="calm"))).notes
     assert notes == ("info.json: key 'weather' is not known, it was ignored",)
+
+
+def test_what_the_file_does_not_say_of_a_video_is_taken_from_it(root: Path) -> None:
+    with imageio.get_writer(root / "train01.mp4", fps=25) as writer:
+        for _ in range(3):
+            writer.append_data(np.zeros((16, 32, 3), np.uint8))
+    changes = {"frame_num": None, "frame_rate": None, "camera_hw": None}
+    frames = read_capture(edited(root, video(**changes))).splits["train"][5:8]
+    assert [frame.time for frame in frames] == pytest.approx([0, 0.04, 0.08])
+    assert {(frame.intrinsics.width, frame.intrinsics.height) for frame in frames} == {(32, 16)}
+
+
+def test_a_video_named_twice_has_frames_of_two_names(root: Path) -> None:
+    frames = read_capture(edited(root, video(file_name="train00.mp4"))).splits["train"]
+    assert len({frame.name for frame in frames}) == 15
