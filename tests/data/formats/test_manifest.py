@@ -110,6 +110,7 @@ MATRIX = r"frames\[1\].transform_matrix"
         (frame(file_path="train/r_1\0"), r"frames\[1\].file_path must be printable text, got 'train/r_1\\x00'"),
         (frame(file_path="train/\ud800"), r"frames\[1\].file_path must be printable text"),
         (frame(file_path="x" * 5000), r"frames\[1\].file_path must be printable text"),
+        (frame(file_path="ü" * 200), r"frames\[1\].file_path must have names of at most 255 bytes"),
         (frame(file_path=""), r"frames\[1\].file_path must be printable text"),
         (frame(file_path="."), r"frames\[1\].file_path must stay inside"),
         (frame(file_path="/etc/passwd"), r"frames\[1\].file_path must stay inside .*; write it relative to"),
