@@ -1,4 +1,5 @@
-"""The same small scene in the files of every format, written here by hand, not by the code under test.
+"""The same small scene in the files of every format, written here by hand, not by the code under test; and frames as
+files have them, neither placed in the world nor timed anew.
 
 Four cameras of 8 x 6 pixels look at a point from around it, at times 0 to 3.
 """
@@ -10,7 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image
+
+from dnerf.data import Frames
+from dnerf.data.formats import read_capture
+from dnerf.data.loading import load_frames
 
 WIDTH, HEIGHT, FOCAL = 8, 6, 9.5
 NUM_FRAMES = 4
@@ -190,3 +196,15 @@ WRITERS = {
     "blender": write_blender, "transforms": write_transforms, "nerfies": write_nerfies, "llff": write_llff,
     "colmap": write_colmap, "rig": write_rig,
 }  # fmt: skip
+
+
+def frames_of(root: Path, split: str, resolution: int | None = None) -> Frames:
+    """A split whose times are in [0, 1], in the files' own units."""
+    capture = read_capture(root)
+    loaded = load_frames(capture.splits[split], resolution=resolution)
+    poses = torch.tensor([frame.pose for frame in loaded.frames], dtype=torch.float64).float()
+    times = torch.tensor([0.0 if frame.time is None else frame.time for frame in loaded.frames])
+    background = None if loaded.has_alpha else capture.background
+    names = tuple(frame.name for frame in loaded.frames)
+    planes = capture.planes or (2.0, 6.0)
+    return Frames(loaded.images, poses, times, loaded.intrinsics, *planes, background, names)
