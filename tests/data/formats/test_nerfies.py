@@ -5,7 +5,9 @@ from typing import Any
 import data_folders
 import numpy as np
 import pytest
+import torch
 
+from dnerf.core.cameras import Camera
 from dnerf.core.lenses import Distortion
 from dnerf.data.formats import read_capture
 
@@ -43,6 +45,21 @@ def test_lenses_and_both_names_of_tangential_coefficients_are_used(root: Path) -
     assert lenses[0] is None
     assert lenses[1] == Distortion("opencv", (0.1, -0.01, 0.0), (0.001, 0.002))
     assert lenses[2] == Distortion("opencv", (0.0, 0.0, 0.0), (0.001, 0.002))
+
+
+def test_a_phones_lens_that_moves_the_corners_inwards_does_not_fold(root: Path) -> None:
+    """HyperNeRF's cake: tangential terms take more of the corner than the radial ones leave room for."""
+    edit(
+        root / "camera/000001.json", image_size=[480, 856], focal_length=716.3578, principal_point=[310.0815, 453.308],
+        radial_distortion=[0.0955, -0.2321, 0.0], tangential_distortion=[0.0024941, 0.030058],
+    )  # fmt: skip
+    frame = read_capture(root).splits["train"][1]
+    camera = Camera(frame.intrinsics, torch.tensor(frame.pose, dtype=torch.float64), 1.0, 2.0)
+    corners = torch.tensor([0, 479, 855 * 480, 856 * 480 - 1])
+    rays = camera.rays(0.0, corners)
+    pixels = camera.project(rays.origins + 5 * rays.directions)[0]
+    expected = torch.stack([corners % 480, corners // 480], -1).double()
+    torch.testing.assert_close(pixels, expected, atol=1e-6, rtol=0)  # the lens is inverted to 1e-6 pixels
 
 
 def test_frames_for_validation_are_the_test_split(root: Path) -> None:
