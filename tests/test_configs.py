@@ -94,7 +94,7 @@ def test_every_callback_joins_the_training(callback: str, tmp_path: Path) -> Non
 
 def test_the_default_callbacks_come_in_this_order() -> None:
     """Recovery first, since later ones do not see the record of a step that it takes back."""
-    wanted = ["recovery", "log", "checkpoints", "progress_bar", "box_warning"]
+    wanted = ["recovery", "log", "checkpoints", "progress_bar", "box_warning", "weight_average"]
     assert list(composed("experiment=fast").trainer.callbacks) == wanted
 
 

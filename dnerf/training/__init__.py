@@ -1,5 +1,6 @@
 """Training a renderer on frames."""
 
+from dnerf.training.averaging import WeightAverage
 from dnerf.training.callbacks import BoxWarning, Callback, ProgressBar
 from dnerf.training.checkpoint_folder import CheckpointFolder, Checkpoints
 from dnerf.training.logging import JsonLinesLog, Previews, TensorBoardLog
@@ -11,6 +12,7 @@ from dnerf.training.signals import TrainingStopped
 from dnerf.training.trainer import Trainer
 
 __all__ = [
-    "AdamMuon", "AdamSettings", "BoxWarning", "Callback", "CheckpointFolder", "Checkpoints", "JsonLinesLog", "Previews",
-    "ProgressBar", "Recovery", "Run", "TensorBoardLog", "Trainer", "TrainingRecord", "TrainingStopped",
+    "AdamMuon", "AdamSettings", "BoxWarning", "Callback", "CheckpointFolder", "Checkpoints", "JsonLinesLog",
+    "Previews", "ProgressBar", "Recovery", "Run", "TensorBoardLog", "Trainer", "TrainingRecord",
+    "TrainingStopped", "WeightAverage",
 ]  # fmt: skip

@@ -16,6 +16,7 @@ from dnerf.fields import DeformedField, GridField, RadianceField
 from dnerf.losses import AppearanceConstancyLoss, ElasticLoss, PhotometricLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import OccupancyGrid, OccupancySampler
+from dnerf.training.averaging import WeightAverage
 from dnerf.training.callbacks import Callback, ProgressBar
 from dnerf.training.optimizer import AdamSettings
 from dnerf.training.recovery import Recovery
@@ -91,7 +92,7 @@ def make_trainer(
     Args:
         max_seconds: most seconds of training, or None.
         num_steps: most steps.
-        callbacks: by name; recovery and a progress bar if None.
+        callbacks: by name; recovery, a progress bar and averaged weights if None.
 
     Raises:
         ValueError: for numbers out of range.
@@ -107,6 +108,8 @@ def make_trainer(
         {"default": 2e-2, "deformation": 6e-3, "deformation_output": 1.5e-3, "head": 5e-3},
         final_rate=0.05, hold_until=0.3, warmup_steps=20, betas=(0.9, 0.99), epsilon=1e-15, orthogonal=True,
     )  # fmt: skip
+    if callbacks is None:
+        callbacks = {"recovery": Recovery(), "progress_bar": ProgressBar(), "weight_average": WeightAverage()}
     return Trainer(
         num_steps=num_steps,
         max_seconds=max_seconds,
@@ -115,5 +118,5 @@ def make_trainer(
         losses=losses,
         pixels=ErrorGuidedPixels(TemporalCurriculum(0.3, 0.05)),
         optimizer=optimizer,
-        callbacks={"recovery": Recovery(), "progress_bar": ProgressBar()} if callbacks is None else callbacks,
+        callbacks=callbacks,
     )

@@ -12,7 +12,7 @@ from small_runs import BOX, run_of, small_frames, small_renderer, small_trainer,
 
 from dnerf.data.pixel_samplers import ErrorGuidedPixels, TemporalCurriculum
 from dnerf.losses import PhotometricLoss, UnseenSpaceLoss
-from dnerf.training import Callback, CheckpointFolder, Checkpoints, Recovery, Run, Trainer
+from dnerf.training import Callback, CheckpointFolder, Checkpoints, Recovery, Run, Trainer, WeightAverage
 from dnerf.training.checkpoint import encode_run, max_bytes, restore_run
 from dnerf.training.tensor_files import decode, encode, save_weights
 
@@ -80,7 +80,12 @@ def trainer(stop: int = -1, spoilt: int = -1, **changes: Any) -> Trainer:
     return small_trainer(
         pixels=ErrorGuidedPixels(TemporalCurriculum(0.5, 0.3), share=0.5, resolution=4),
         losses={"rgb": PhotometricLoss(), "unseen": UnseenSpaceLoss(BOX, every=2, memory_samples=100)},
-        callbacks={"checkpoints": Checkpoints(4), "recovery": Recovery(), "counts": Counts(stop, spoilt)},
+        callbacks={
+            "checkpoints": Checkpoints(4),
+            "recovery": Recovery(),
+            "counts": Counts(stop, spoilt),
+            "average": WeightAverage(every=3),
+        },
         **({"log_every": 1} | changes),
     )
 
