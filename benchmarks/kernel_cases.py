@@ -22,6 +22,7 @@ from dnerf.kernels import (
     packed_sum,
     packed_weights,
     relu_layers,
+    series_sums,
     skip_distances,
     thin_out,
     use_backend,
@@ -36,6 +37,7 @@ MAX_ROWS = 1 << 17
 STEP = 0.03
 SPACING = 0.06  # along a ray, of samples at which the deformation is evaluated
 WIDTHS = (32, 128, 128, 128, 128)  # of the network of a deformation
+SERIES = (4 + 3 * 12, 12)  # coefficients of density and colours, and functions of time and direction
 HEAD = (len(RESOLUTIONS) * NUM_FEATURES, 64, 64, 4)  # of the network behind a grid's features
 
 Call = Callable[[], Any]
@@ -102,6 +104,7 @@ class Workload:
         self.inputs = normal(self.num_samples, WIDTHS[0]).to(device)
         self.layers = [layer.to(device) for layer in _layers(WIDTHS, normal)]
         self.head = [layer.to(device) for layer in _layers(HEAD, normal)]
+        self.series = normal(self.num_samples, sum(SERIES)).to(device)
 
     def march(self) -> MarchedSamples:
         """The samples of all rays."""
@@ -192,6 +195,13 @@ def _network_cases(work: Workload, n: int) -> list[Case]:
             None,
             (work.inputs, *work.layers),
             (activations + layers, 3 * activations + 3 * layers),
+        ),
+        *_both(
+            "series_sums",
+            series_sums,
+            None,
+            [x.contiguous() for x in work.series.split(SERIES, dim=1)],
+            (n * (sum(SERIES) + 4), n * (3 * sum(SERIES) + 4)),
         ),
     ]
 

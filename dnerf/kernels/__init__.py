@@ -12,6 +12,7 @@ from .packed_sum import packed_sum
 from .packed_weights import packed_weights
 from .relu_layers import is_bfloat16_wanted, relu_layers
 from .seen_parts import SeenParts, seen_parts
+from .series_sums import series_sums
 from .shade import shade
 from .skip_distances import skip_distances
 from .thin_out import thin_out
@@ -20,6 +21,6 @@ from .trace_network import FrameTables, is_traced, trace_network
 __all__ = [
     "BACKENDS", "Footprints", "FrameTables", "GridLevels", "MarchGrid", "MarchedSamples", "SeenParts", "add_seen",
     "covered_places", "footprints", "get_backend", "grid_encode", "grid_network", "is_bfloat16_wanted", "is_traced",
-    "march", "march_to_size", "packed_sum", "packed_weights", "relu_layers", "seen_parts", "set_backend", "shade",
-    "skip_distances", "thin_out", "trace_network", "use_backend",
+    "march", "march_to_size", "packed_sum", "packed_weights", "relu_layers", "seen_parts", "series_sums", "set_backend",
+    "shade", "skip_distances", "thin_out", "trace_network", "use_backend",
 ]  # fmt: skip

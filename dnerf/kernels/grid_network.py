@@ -20,8 +20,8 @@ def grid_network(
     """`relu_layers` of `grid_encode`, and a last linear layer: W x + b. Not differentiable.
 
     Under autocast to bfloat16, on CPUs that multiply vectors in it but no tiles (AMX), features and what is between
-    layers never leave the nearest caches: at most 16 outputs, hidden layers in multiples of 16, an even number of
-    features. The last layer's products are then not rounded.
+    layers never leave the nearest caches: hidden layers in multiples of 16, an even number of features. The last
+    layer's products are then not rounded.
 
     Args:
         positions: (N, 3), in [0, 1].

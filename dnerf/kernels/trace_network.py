@@ -1,5 +1,6 @@
 """Rendering rays of one time through a lattice of displacements and a network on a grid's features."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dnerf.core.checks import check_positive, check_shape, check_whole
+from dnerf.core.spherical_harmonics import spherical_harmonics
 
 from .backend import run_compiled
 from .checks import check_cells, check_shapes
@@ -31,8 +33,9 @@ class FrameTables:
         is_known: (Lz + 1, Ly + 1, Lx + 1) bool, the vertices of which they are known; V in all.
         low, sides: (3,) lowest corner and sides of that lattice, in world units.
         field_low, field_scale: (3,) lowest corner of the grid's box, in canonical space, and one by its sides.
-        table, levels, weights, biases: see `grid_network`; of four outputs.
-        shifts: (4,) added to the network's outputs: the logarithm of density, red, green and blue before a sigmoid.
+        table, levels, weights, biases: see `grid_network`; of 1 + 3 (degree + 1)^2 outputs: density, then, for red,
+            green and blue in turn, coefficients of spherical harmonics.
+        shifts: added to the network's outputs: the logarithm of density, and coefficients of colours before a sigmoid.
 
     Raises:
         ValueError: a shape or dtype that does not fit.
@@ -58,14 +61,25 @@ class FrameTables:
         check_cells("is_known", self.is_known, "Lz + 1, Ly + 1, Lx + 1", least=2)
         check_shape("skips", self.skips, blocks_shape(self.occupancy[None])[1:])
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("low", "sides", "field_low", "field_scale"), (3,))
-        shapes |= {"aabb": (2, 3), "displacements": (self.is_known.numel(), 4), "shifts": (4,)}
+        shapes |= {"aabb": (2, 3), "displacements": (self.is_known.numel(), 4)}
+        shapes |= {"shifts": (1 + 3 * (self.degree + 1) ** 2,)}
         for name, shape in shapes.items():
             check_shape(name, getattr(self, name), shape)
             if getattr(self, name).dtype != torch.float32:
                 raise ValueError(f"{name} must be float32, got {getattr(self, name).dtype}")
         check_grid(self.table[:0, :1].expand(0, 3), self.table, self.levels)
-        if len(self.weights) < 2 or len(self.weights[-1]) != 4:
-            raise ValueError("weights must be of at least two layers, the last one with four outputs")
+
+    @property
+    def degree(self) -> int:
+        """Of the harmonics; ValueError if that many outputs are not those of any."""
+        num_outputs = len(self.weights[-1]) if len(self.weights) > 1 else 0
+        degree = math.isqrt(max(num_outputs - 1, 0) // 3) - 1
+        if num_outputs != 1 + 3 * (degree + 1) ** 2 or degree < 0:
+            raise ValueError(
+                "weights must be of at least two layers, the last one with 1 + 3 (degree + 1)^2 outputs, got "
+                f"{len(self.weights)} layers with {num_outputs}"
+            )
+        return degree
 
 
 def is_traced(positions: Tensor, in_features: int, weights: Sequence[Tensor]) -> bool:
@@ -80,10 +94,11 @@ def trace_network(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Follow rays front to back through the intervals of `march` (jitter 0), evaluating a network, to their end.
 
-    Of an interval's middle x, the displacement d(x) is interpolated; `grid_network` at x + d(x) gives a, b_1, b_2, b_3:
-    density `exp(min(a, 15))`, colour `sigmoid(b)`. If intervals are cut, those whose weight does not exceed
-    `min_weight` are left out, those up to `subdivision_weight` are composited whole, and the parts of all others are.
-    Nothing is evaluated behind the end of a ray. Not differentiable.
+    Of an interval's middle x, the displacement d(x) is interpolated; `grid_network` at x + d(x) gives a, and b_k of
+    each colour: density `exp(min(a, 15))`, colour `sigmoid(sum_k Y_k b_k)`, with `spherical_harmonics` Y of the ray's
+    direction. If intervals are cut, those whose weight does not exceed `min_weight` are left out, those up to
+    `subdivision_weight` are composited whole, and the parts of all others are. Nothing is evaluated behind the end of a
+    ray. Not differentiable.
 
     Args:
         origins, directions, near, far: of R rays, see `march`.
@@ -107,7 +122,8 @@ def trace_network(
     rays = [x.float() for x in (origins, directions, near, far)]
     scalars = [float(x) for x in (step, min_weight, subdivision_weight, stop_transmittance)]
     if tables.table.dtype == torch.float32 and is_traced(rays[0], tables.weights[0].shape[1], tables.weights):
-        return run_compiled("trace_network", "trace_network", rays[0], rays, tables, subdivision, scalars)
+        basis = spherical_harmonics(rays[1], tables.degree)
+        return run_compiled("trace_network", "trace_network", basis, rays, tables, subdivision, scalars)
     return trace_network_reference(rays, tables, subdivision, scalars)
 
 
@@ -123,7 +139,7 @@ def trace_network_reference(
     states[:, 0] = 1
     is_done, goes_on = (torch.ones(len(origins), dtype=torch.bool, device=near.device) for _ in range(2))
 
-    shape = tables.is_known.shape
+    shape, basis = tables.is_known.shape, spherical_harmonics(directions, tables.degree)
     levels = GridLevels([[length - 1 for length in reversed(shape)]], 1 << (shape.numel() - 1).bit_length())
 
     def ask(chosen: Tensor, middles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -133,8 +149,10 @@ def trace_network_reference(
         places = places + grid_encode_reference(lattice, tables.displacements[:, :3], levels)
         places[~((lattice >= 0) & (lattice <= 1)).all(-1)] = torch.nan
         unit = (places - tables.field_low) * tables.field_scale
-        raw = grid_network_reference(unit, tables.table, tables.levels, tables.weights, tables.biases)
-        return *shade_reference(raw.float(), tables.shifts, 0.0), places.isfinite().all(-1)
+        raw = grid_network_reference(unit, tables.table, tables.levels, tables.weights, tables.biases).float()
+        density, colors = (raw + tables.shifts).tensor_split([1], dim=-1)
+        seen = (colors.unflatten(-1, (3, -1)) * basis[chosen, None]).sum(-1)
+        return *shade_reference(torch.cat([density, seen], dim=-1), raw.new_zeros(4), 0.0), places.isfinite().all(-1)
 
     def add(chosen: Tensor, density: Tensor, rgb: Tensor, middles: Tensor, lengths: Tensor) -> None:
         opacity, light = -torch.expm1(-density * lengths), states[chosen, 0]

@@ -18,7 +18,7 @@ from dnerf.kernels.trace_network import trace_network_reference
 
 BOX = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 0.5, 1.5]])
 LEVELS = GridLevels([4, (9, 6, 7)], 1 << 12)
-WIDTHS = (8, 16, 16, 4)
+WIDTHS = (8, 16, 16)
 OPTIONS = {"step": 0.05, "subdivision": 3, "min_weight": 1e-3, "subdivision_weight": 1e-2, "stop_transmittance": 1e-3}
 
 pytestmark = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
@@ -33,8 +33,11 @@ def fused() -> Iterator[None]:
         yield
 
 
-def scene(seed: int = 0, *, known: float = 1.0, share: float = 0.3, density: float = 2.0, reach: float = 0.15):
+def scene(
+    seed: int = 0, *, known: float = 1.0, share: float = 0.3, density: float = 2.0, reach: float = 0.15, degree: int = 0
+) -> FrameTables:
     """Cells, displacements of which a share is known, and a random network."""
+    widths = (*WIDTHS, 1 + 3 * (degree + 1) ** 2)
     generator = torch.Generator().manual_seed(seed)
     cells = (5, 4, 6)
     is_known = torch.rand([c + 1 for c in reversed(cells)], generator=generator) < known
@@ -44,9 +47,10 @@ def scene(seed: int = 0, *, known: float = 1.0, share: float = 0.3, density: flo
         occupancy=occupancy, skips=skip_distances(occupancy[None])[0], aabb=BOX, is_known=is_known, low=BOX[0],
         displacements=torch.where(is_known.reshape(-1, 1), displacements, torch.nan), sides=BOX[1] - BOX[0],
         field_low=BOX[0] - 0.1, field_scale=1 / (BOX[1] - BOX[0] + 0.2), levels=LEVELS,
-        table=torch.randn(LEVELS.num_rows, 4, generator=generator), shifts=torch.tensor([density, 0.1, -0.1, 0.3]),
-        weights=[torch.randn(b, a, generator=generator) / a**0.5 for a, b in itertools.pairwise(WIDTHS)],
-        biases=[torch.randn(b, generator=generator) for b in WIDTHS[1:]],
+        table=torch.randn(LEVELS.num_rows, 4, generator=generator),
+        shifts=torch.tensor([density, *[0.1, -0.1, 0.3] * (degree + 1) ** 2]),
+        weights=[torch.randn(b, a, generator=generator) / a**0.5 for a, b in itertools.pairwise(widths)],
+        biases=[torch.randn(b, generator=generator) for b in widths[1:]],
     )  # fmt: skip
 
 
@@ -87,10 +91,11 @@ def assert_same(found: tuple[Tensor, Tensor], expected: tuple[Tensor, Tensor], c
     subdivision=st.sampled_from([1, 2, 3, 4]),
     stop=st.sampled_from([0.0, 1e-3, 0.1]),
     share=st.sampled_from([0.0, 0.3, 1.0]),
+    degree=st.sampled_from([0, 0, 1, 2, 3, 4]),
     seed=st.integers(0, 99),
 )
-def test_kernel_equals_definition(count, known, density, subdivision, stop, share, seed) -> None:
-    tables = scene(seed, known=known, density=density, share=share)
+def test_kernel_equals_definition(count, known, density, subdivision, stop, share, degree, seed) -> None:
+    tables = scene(seed, known=known, density=density, share=share, degree=degree)
     options = OPTIONS | {"subdivision": subdivision, "stop_transmittance": stop}
     found, expected = both(rays(count, seed), tables, **options)
     assert_same(found, expected, max(stop, 1e-3))
@@ -111,6 +116,20 @@ def test_closed_form_of_a_uniform_block() -> None:
         assert is_done.all()
         torch.testing.assert_close(states[:, 0], light, rtol=2e-5, atol=1e-7)
         torch.testing.assert_close(states[:, 1:4], (1 - light)[:, None] * torch.sigmoid(tables.shifts[1:]))
+
+
+def test_a_ray_sees_its_own_direction() -> None:
+    """A uniform block whose red follows the first harmonic of z, and nothing else any."""
+    tables = scene(share=1.0, reach=0.0, degree=1)
+    nothing = {name: [torch.zeros_like(p) for p in getattr(tables, name)] for name in ("weights", "biases")}
+    shifts = torch.tensor([6.0, 0, 0, 1, 0, 0, 0, 0, 0, 0.5, 0, 0, 0])
+    tables = FrameTables(**vars(tables) | nothing | {"shifts": shifts})
+    bundle = rays(200)
+    (states, is_done), _ = both(bundle, tables, **OPTIONS)
+    expected = torch.sigmoid(torch.stack([3**0.5 * bundle[1][:, 2], torch.zeros(200), torch.full((200,), 0.5)], dim=-1))
+    torch.testing.assert_close(states[:, 1:4], (1 - states[:, :1]) * expected, rtol=0, atol=1e-5)
+    assert is_done.all()
+    assert (states[:, 0] < 0.5).sum() > 50
 
 
 def test_nan_of_the_network_is_shown_and_where_nothing_is_known_rays_say_so() -> None:
@@ -148,6 +167,8 @@ def test_other_backends_take_the_definition() -> None:
         ({"shifts": torch.zeros(4, dtype=torch.float64)}, "shifts must be float32"),
         ({"table": torch.zeros(5, 4)}, "table must have shape"),
         ({"weights": [torch.zeros(4, 8)]}, "at least two layers"),
+        ({"weights": [torch.zeros(4, 8), torch.zeros(7, 4)]}, r"\(degree \+ 1\)\^2 outputs, got 2 layers with 7"),
+        ({"weights": [torch.zeros(4, 8), torch.zeros(13, 4)]}, r"shifts must have shape \(13,\), got \(4,\)"),
     ],
 )
 def test_wrong_tables_are_refused(wrong: dict, message: str) -> None:

@@ -19,9 +19,9 @@ ROOM = PLACES + MOST_ROWS  # rows of a worker's tables: groups are full
 
 def serves(positions: Tensor, in_features: int, weights: Sequence[Tensor], beside_tiles: bool) -> bool:
     """Whether networks of such sizes are served on this processor."""
-    is_narrow = len(weights) > 1 and len(weights[-1]) <= LANES
+    is_deep = len(weights) > 1
     can = has_vectors() if beside_tiles else is_supported()
-    return can and in_features % 2 == 0 and is_narrow and all(len(w) % LANES == 0 for w in weights[:-1])
+    return can and in_features % 2 == 0 and is_deep and all(len(w) % LANES == 0 for w in weights[:-1])
 
 
 Widths = tuple[tuple[int, ...], ...]
@@ -31,11 +31,16 @@ def network_of(
     table: Tensor, cells: list[int], max_rows: int, weights: list[Tensor], biases: list[Tensor]
 ) -> tuple[tuple[np.ndarray, ...], Widths]:
     """What `ask_network` reads, and the lengths of vectors and groups, as tuples: constants to the compiler."""
-    vectors = vectors_at_once([len(weight) for weight in weights[:-1]])
+    vectors, last = (vectors_at_once(widths) for widths in ([len(w) for w in weights[:-1]], [last_width(weights)]))
     levels = levels_of(tuple(cells), max_rows)
-    packed = Packed(len(levels) * table.shape[1], weights, biases, [vectors] * (len(weights) - 1) + [1])
+    packed = Packed(len(levels) * table.shape[1], weights, biases, [vectors] * (len(weights) - 1) + [last])
     arrays = array(table), levels, packed.layers, packed.weights, packed.biases
-    return arrays, tuple((0,) * n for n in (table.shape[1], ROWS_OF[vectors], vectors, ROWS_OF[1], 1))
+    return arrays, tuple((0,) * n for n in (table.shape[1], ROWS_OF[vectors], vectors, ROWS_OF[last], last))
+
+
+def last_width(weights: list[Tensor]) -> int:
+    """Of a row of outputs in `found`: their number, in multiples of `LANES`."""
+    return -(-len(weights[-1]) // LANES) * LANES
 
 
 def room_of(weights: list[Tensor], workers: int) -> tuple[np.ndarray, ...]:
@@ -44,7 +49,7 @@ def room_of(weights: list[Tensor], workers: int) -> tuple[np.ndarray, ...]:
     return (
         np.zeros((workers, ROOM * weights[0].shape[1]), np.uint16),
         np.zeros((workers, 2, ROOM * widest), np.uint16),
-        np.zeros((workers, ROOM * LANES), np.float32),
+        np.zeros((workers, ROOM * last_width(weights)), np.float32),
     )
 
 
@@ -68,18 +73,19 @@ def _network(
         places, fractions, rows = tables[0][worker], tables[1][worker], tables[2][worker]
         encoded, hidden, found = room[0][worker], room[1][worker], room[2][worker]
         first = next_task(taken) * PLACES
+        width = len(found) // ROOM
         while first < len(positions):
             count = take_places(positions, first, places)
             ask_network(count, network, widths, (places, fractions, rows), encoded, hidden, found)
             for i in range(count):
                 for k in range(out.shape[1]):
-                    out[first + i, k] = found[i * LANES + k]
+                    out[first + i, k] = found[i * width + k]
             first = next_task(taken) * PLACES
 
 
 @njit(fastmath=FAST, **BORROWS)
 def ask_network(count: int, network: Any, widths: Any, tables: Any, encoded: Any, hidden: Any, found: Any) -> None:
-    """The outputs, in rows of `LANES`, for so many places, which are in the first table."""
+    """The outputs, in rows of `last_width`, for so many places, which are in the first table."""
     table, levels, layers, weights, biases = network
     lanes, group, vectors, last_group, last_vectors = widths
     places, fractions, rows = tables

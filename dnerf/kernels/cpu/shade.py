@@ -29,16 +29,16 @@ def shade(raw: Tensor, bias: Tensor, log_shift: float) -> tuple[Tensor, Tensor]:
 
 
 @intrinsic
-def _single(typing: Any, number: Any) -> tuple[Any, Any]:
-    """A float32 as it is, or that of which a uint16 has the upper half: one in bfloat16."""
+def single(typing: Any, number: Any) -> tuple[Any, Any]:
+    """A float as it is, or the float32 of which a uint16 has the upper half: one in bfloat16."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        if number == types.float32:
+        if number != types.uint16:
             return arguments[0]
         word = ir.IntType(32)
         return builder.bitcast(builder.shl(builder.zext(arguments[0], word), word(16)), ir.FloatType())
 
-    return types.float32(number), generate
+    return (types.float32 if number == types.uint16 else number)(number), generate
 
 
 # No fast-math: NaN stays NaN.
@@ -51,7 +51,7 @@ def _shade(raw: Any, shifts: Any, density: Any, rgb: Any, lines: Any, taken: Any
             line = lines[worker]
             for i in range(count):
                 for k in range(4):
-                    line[k, i] = _single(raw[first + i, k]) + shifts[k]
+                    line[k, i] = single(raw[first + i, k]) + shifts[k]
             logs, found = line[0], density[first : first + count]
             for i in range(len(found)):
                 found[i] = exp(MOST if logs[i] > MOST else logs[i])

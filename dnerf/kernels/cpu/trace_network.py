@@ -13,9 +13,8 @@ from ..shade import MOST_LOG_DENSITY
 from ..trace_network import NUM_STATES, FrameTables
 from .cells import PLACES, cell_tables, clamped, fractions_at, locate_in_lattice, rows_at
 from .course import LINE, RAYS_AT_ONCE, TESTED_AT_ONCE, course_of, interval, new_cells, next_kept, ranges_and_bounds
-from .dense import LANES
 from .exponential import exp, expm1, sigmoid
-from .grid_network import ask_network, network_of, room_of
+from .grid_network import ROOM, ask_network, network_of, room_of
 from .launch import BORROWS, array, kernel, launch, next_task, none_taken, num_threads
 from .rows import blend_rows, trailing_zeros
 
@@ -26,7 +25,7 @@ ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
 def trace_network(
-    _: Tensor, rays: list[Tensor], tables: FrameTables, subdivision: int, scalars: list[float]
+    basis: Tensor, rays: list[Tensor], tables: FrameTables, subdivision: int, scalars: list[float]
 ) -> tuple[Tensor, Tensor]:
     step, min_weight, subdivision_weight, stop_transmittance = (np.float32(x) for x in scalars)
     o, d, t0, t1 = (array(x) for x in rays)
@@ -41,7 +40,8 @@ def trace_network(
     displacements, shape = array(tables.displacements), tables.is_known.shape
     level, columns = (shape[2] - 1, shape[1] - 1, shape[0] - 1, 0, -1), displacements.shape[1]
     launch(
-        _trace, (o, d, t0, ranges, counts), (occupancy.ravel(), occupancy.shape, reach, bounds[0], aabb, step),
+        _trace, (o, d, t0, ranges, counts, array(basis)),
+        (occupancy.ravel(), occupancy.shape, reach, bounds[0], aabb, step),
         (displacements, level, array(tables.low), array(tables.sides)),
         (array(tables.field_low), array(tables.field_scale), array(tables.shifts)), network,
         (subdivision, min_weight, subdivision_weight, stop_transmittance), states.numpy(), is_done.numpy(),
@@ -69,7 +69,7 @@ def _trace(
 ) -> None:  # fmt: skip
     """Each worker has up to `PLACES` rays under way: their `numbers`, the bits of the `kept` intervals that are still
     to come, and of those they are at `spans`, where they begin and how long they are, and what becomes of them."""
-    origins, directions, near, ranges, counts = rays
+    origins, directions, near, ranges, counts, basis = rays
     occupancy, shape, skips, bounds, aabb, step = grid
     displacements, level, low, sides = lattice
     num_groups = (len(near) + RAYS_AT_ONCE - 1) // RAYS_AT_ONCE
@@ -82,7 +82,7 @@ def _trace(
         asked = (
             (origins, directions, numbers, owners, distances),
             (displacements, level, low, sides, columns, moved),
-            field,
+            (*field, basis),
             (network, (lanes, group, vectors, last_group, last_vectors)),
             (tables[0][worker], tables[1][worker], tables[2][worker]),
             (room[0][worker], room[1][worker], room[2][worker]),
@@ -224,7 +224,8 @@ def _any(kept: Any) -> bool:
 @njit(**BORROWS)
 def _ask(count: int, first: int, asked: Any, values: Any) -> None:
     """Density and colours at so many places, from one on, and what is NaN where nothing is known of them: (5, n)."""
-    (origins, directions, numbers, owners, distances), lattice, (field_low, scale, shifts), nets, work, own = asked
+    (origins, directions, numbers, owners, distances), lattice, field, nets, work, own = asked
+    field_low, scale, shifts, basis = field
     displacements, level, low, sides, columns, moved = lattice
     places, fractions, rows = work
     encoded, hidden, found = own
@@ -242,9 +243,7 @@ def _ask(count: int, first: int, asked: Any, values: Any) -> None:
             total += place
         values[UNKNOWN, i] = total - total  # NaN of what is no number
     ask_network(count, nets[0], nets[1], work, encoded, hidden, found)
-    for i in range(count):
-        for k in range(4):
-            values[k, i] = found[i * LANES + k] + shifts[k]
+    _look(count, basis, numbers, owners[first:], shifts, found, values)
     densities = values[0, :count]
     for i in range(len(densities)):
         densities[i] = exp(MOST if densities[i] > MOST else densities[i])
@@ -252,6 +251,21 @@ def _ask(count: int, first: int, asked: Any, values: Any) -> None:
         colors = values[k, :count]
         for i in range(len(colors)):
             colors[i] = sigmoid(colors[i])
+
+
+@njit(**BORROWS)
+def _look(count: int, basis: Any, numbers: Any, owners: Any, shifts: Any, found: Any, values: Any) -> None:
+    """Before their activations, density and the colours that each place's ray sees: sums over its harmonics."""
+    width, terms = len(found) // ROOM, basis.shape[1]
+    for i in range(count):
+        start, seen = i * width, basis[numbers[owners[i]]]
+        values[0, i] = found[start] + shifts[0]
+        for c in range(3):
+            at = 1 + c * terms
+            total = found[start + at] + shifts[at]  # the first harmonic is one
+            for k in range(1, terms):
+                total += seen[k] * (found[start + at + k] + shifts[at + k])
+            values[1 + c, i] = total
 
 
 @njit(forceinline=True, **BORROWS)
