@@ -17,6 +17,7 @@ from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, series_sums, shade
 from dnerf.nn.encodings import SinusoidalEncoding
 from dnerf.nn.mlp import MLP
+from dnerf.nn.output_labels import HasOutputLabels
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
 # Of harmonics beside the constant, which stays one: this makes them orthonormal. All coefficients take steps of one
@@ -24,7 +25,7 @@ from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 VIEW_SCALE = 1 / math.sqrt(4 * math.pi)
 
 
-class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
+class GridField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels, Scheduled):
     """Features interpolated in grids of several resolutions, then a small MLP for density and colour.
 
     Source: instant-ngp (Mueller et al. 2022): levels are dense while their vertices fit into `max_rows` rows and
@@ -118,6 +119,14 @@ class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
     def parameter_groups(self) -> list[ParameterGroup]:
         """The networks in "head"; features, which wait long for their turn, are left in "default"."""
         return [ParameterGroup("head", tuple(self.head.parameters()))]
+
+    def output_labels(self) -> dict[str, list[str]]:
+        """What the rows of the head's last layer are coefficients of."""
+        waves = [f"wave {order}" for order in range(self.temporal_terms)]
+        harmonics = [f"harmonic {number}" for number in range(1, (self.view_degree + 1) ** 2)]
+        colors = [f"{color} {term}" for color in ("red", "green", "blue") for term in waves + harmonics]
+        labels = [f"density {wave}" for wave in waves] + colors
+        return {"head.output.weight": labels, "head.output.bias": labels}
 
     def set_progress(self, progress: float) -> None:
         """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""

@@ -7,14 +7,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_runs import small_frames, small_renderer, small_trainer, weights
+from small_runs import BOX, small_frames, small_renderer, small_trainer, weights
 
+from dnerf.core.backgrounds import RandomBackground
 from dnerf.data import Frames, SyntheticData
+from dnerf.fields import GridField
 from dnerf.planning import Decision, Evidence, Finding, MotionEvidence, Part, Plan, make_plan
 from dnerf.planning.plan import fingerprint, load_plan
 from dnerf.planning.planner import LEAST_STEPS
 from dnerf.planning.trials import Contender, Effort, HeldOut, contest, gain, split_frames
 from dnerf.rendering import Renderer
+from dnerf.samplers import OccupancyGrid, OccupancySampler
 from dnerf.scenes import make_scene
 from dnerf.training import AdamSettings, Trainer
 
@@ -176,3 +179,25 @@ def test_part_names_its_candidates() -> None:
         Part("", CANDIDATES, "swift")
     with pytest.raises(ValueError, match="candidates"):
         Part("", {"slow": []}, "slow")
+
+
+def test_fork_with_more_outputs_renders_the_same_and_keeps_what_it_knew() -> None:
+    """Harmonics and waves are new; density and colour go on as they were."""
+
+    def grids(choices: Mapping[str, str]) -> tuple[Renderer, Trainer]:
+        torch.manual_seed(len(choices))
+        degree = 2 if "rate" in choices else None
+        field = GridField(BOX, (4, 8), hidden_features=8, temporal_terms=1 + len(choices), view_degree=degree)
+        grid = OccupancyGrid(BOX, 8, num_slabs=2, update_every=3, num_probes=64)
+        return Renderer(field, OccupancySampler(grid, 0.1, pad_to=64), RandomBackground()), small_trainer(num_steps=50)
+
+    frames = small_frames(8)
+    leading = Contender.fresh("", grids, {}, frames, 0)
+    leading.advance(Effort(6, 0.0))
+    fork = leading.forked("quick", grids, {"rate": "quick"}, frames, 0)
+    positions, times = torch.rand(64, 3) * 2 - 1, torch.rand(64)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3), dim=-1)
+    before, after = (x.run.renderer.field(positions, directions, times) for x in (leading, fork))
+    torch.testing.assert_close(after.density, before.density)
+    torch.testing.assert_close(after.rgb, before.rgb)
+    assert len(fork.run.renderer.field.head.output.bias) == 2 + 3 * (2 + 8)
