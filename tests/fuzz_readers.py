@@ -224,7 +224,7 @@ def config(folder: Path) -> Reader:
     folder.mkdir(parents=True)
     value = {
         "seed": 0,
-        "data": {"_target_": "dnerf.data.BlenderData", "root": "x", "box": [[-1, -1, -1], [1, 1, 1]]},
+        "data": {"_target_": "dnerf.data.FolderData", "root": "x", "box": [[-1, -1, -1], [1, 1, 1]]},
         "renderer": {"_target_": "dnerf.rendering.Renderer", "field": {"_target_": "dnerf.fields.NeRFField"}},
     }
 

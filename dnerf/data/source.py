@@ -148,7 +148,8 @@ class SyntheticData(DataSource):
                 box, by = _rounded(fit_box(self._train)), "fitted to the frames"
             else:
                 box, by = as_corners(self._box.tolist()), "as given"
-            note = f"box: {[list(corner) for corner in box]}, {by}"
+            shown = ", ".join("[" + ", ".join(f"{x:g}" for x in corner) + "]" for corner in box)
+            note = f"box: [{shown}], {by}"
             self._world = World(box, has_alpha=self.background is None, notes=(note,))
         return self._world
 
