@@ -1,6 +1,6 @@
 """Mutated inputs for everything that reads files of others: data sets, checkpoints, configs of runs.
 
-    python tests/fuzz_readers.py --inputs 100000 [--seed 0]
+    python tests/fuzz_readers.py --inputs 100000 [--seed 0] [--readers colmap llff]
 
 A reader may return or raise ValueError in one line; anything else is a failure, as are more than 5 s of processor time
 for one input or more than 1 GiB of memory beyond that of a process which has loaded everything. The tests run fewer, by
@@ -10,6 +10,7 @@ hypothesis.
 import argparse
 import json
 import math
+import os
 import random
 import resource
 import struct
@@ -18,6 +19,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +30,12 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "scripts")]
 
+import data_folders  # noqa: E402
 from small_runs import run_of, small_renderer  # noqa: E402
 
-from dnerf.data import load_blender  # noqa: E402
+from dnerf.data.capture import Capture  # noqa: E402
+from dnerf.data.formats import read_capture  # noqa: E402
+from dnerf.data.loading import load_frames  # noqa: E402
 from dnerf.training.checkpoint import encode_run, max_bytes, restore_run  # noqa: E402
 from dnerf.training.checkpoint_folder import CheckpointFolder  # noqa: E402
 from dnerf.training.runs import load_config  # noqa: E402
@@ -39,7 +44,11 @@ from dnerf.training.tensor_files import decode, encode, load_weights, save_weigh
 MAX_SECONDS = 5.0
 MAX_MEMORY = 2**30
 Reader = Callable[[random.Random], None]  # writes mutated files and reads them
-KEYS = ["w", "h", "fl_x", "cx", "k1", "near", "far", "background", "pixel_origin", "x"]
+KEYS = [
+    "w", "h", "fl_x", "cx", "k1", "k5", "p1", "near", "far", "background", "pixel_origin", "K", "camera_model", "up",
+    "is_fisheye", "camera_angle_y", "mask_path", "timestamp", "ply_file_path", "train_filenames", "latlong", "skew",
+    "x",
+]  # fmt: skip
 
 WEIRD_VALUES: list[Any] = [
     None, True, False, 0, -1, 1, 2, 3.5, 1e-320, 1e308, -1e308, math.nan, math.inf, -math.inf, 2**31, 2**63, -(2**64),
@@ -122,40 +131,115 @@ def mutate_png(data: bytes, chance: random.Random) -> bytes:
     return data[:8] + b"".join(packed)
 
 
-def data_set(folder: Path) -> Reader:
-    """A small scene, one of whose files is spoilt at a time."""
-    (folder / "train").mkdir(parents=True)
-    pose = [[1.0, 0, 0, 0.5], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1.0]]
-    names = ["./train/r_0", "train/r_1.png", "train/r_2.jpg"]
-    frames = [{"file_path": n, "time": i / 2, "transform_matrix": pose} for i, n in enumerate(names)]
-    manifest = {"camera_angle_x": 0.7, "frames": frames}
-    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 4), dtype=np.uint8)
-    for index in (0, 1):
-        Image.fromarray(pixels).save(folder / "train" / f"r_{index}.png")
-    Image.fromarray(pixels[..., :3]).save(folder / "train" / "r_2.jpg")
-    listed = folder / "transforms_train.json"
-    listed.write_text(json.dumps(manifest))
-    originals = {path: path.read_bytes() for path in (listed, *sorted((folder / "train").iterdir()))}
+def check_capture(capture: Capture, root: Path) -> None:
+    """What everything that follows relies on, of a reader's answer to any input."""
+    inside = os.path.realpath(root)
+    for frames in capture.splits.values():
+        assert frames
+        assert len({frame.name for frame in frames}) == len(frames)
+        timed = {frame.time is None for frame in frames}
+        assert len(timed) == 1
+        for frame in frames:
+            pose = np.array(frame.pose)
+            assert pose.shape == (4, 4)
+            assert np.isfinite(pose).all()
+            assert np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-3
+            assert np.linalg.det(pose[:3, :3]) > 0
+            assert frame.time is None or math.isfinite(frame.time)
+            for path in (frame.mask, frame.image.path if frame.image else None):
+                assert path is None or os.path.commonpath([os.path.realpath(path), inside]) == inside
+    assert capture.planes is None or 0 <= capture.planes[0] < capture.planes[1] < math.inf
+    assert capture.points is None or bool(capture.points.isfinite().all())
+    assert all("\n" not in note for note in capture.notes)
 
-    def read(chance: random.Random) -> None:
-        path = chance.choice([listed, *originals])
-        data = spoilt = originals[path]
-        if path == listed and chance.random() < 0.7:
-            value = manifest
-            for _ in range(chance.choice([1, 1, 2])):
-                value = mutate_json(value, chance)
-            spoilt = json.dumps(value).encode()
-        elif path.suffix == ".png" and chance.random() < 0.6:
-            spoilt = mutate_png(data, chance)
-        else:
-            spoilt = mutate_bytes(data, chance)
-        path.write_bytes(spoilt)
-        try:
-            assert load_blender(folder, "train", chance.choice([None, 4])).images.dtype == torch.uint8
-        finally:
-            path.write_bytes(data)
 
-    return read
+def mutate_binary(data: bytes, chance: random.Random) -> bytes:
+    """Bytes of which some are numbers: a count, an index or a float that is out of all bounds, at any place."""
+    if chance.random() < 0.5:
+        return mutate_bytes(data, chance)
+    result = bytearray(data)
+    place = chance.choice([0, chance.randrange(len(data)), 8 * chance.randrange(1 + len(data) // 8)])
+    layout = chance.choice(["<Q", "<i", "<d"])
+    values = {
+        "<Q": [0, 1, 2, 255, 2**20, 2**31, 2**40, 2**63, 2**64 - 1], "<i": [0, -1, 1, 5, 10, 2**31 - 1],
+        "<d": [0.0, -1.0, 1e-320, 1e30, 1e308, math.nan, math.inf],
+    }  # fmt: skip
+    packed = struct.pack(layout, chance.choice(values[layout]))
+    result[place : place + len(packed)] = packed
+    return bytes(result)
+
+
+def folder_of(write: Callable[[Path], object], *, decode: bool = True) -> Callable[[Path], Reader]:
+    """A reader of a folder, one of whose files is spoilt at a time; and of its images, where `decode` says so."""
+
+    def make(folder: Path) -> Reader:
+        root = folder / "scene"
+        write(root)
+        originals = {path: path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+        images = [path for path in originals if path.suffix in (".png", ".jpg")]
+        others = [path for path in originals if path not in images and path.suffix != ".mp4"]
+
+        def read(chance: random.Random) -> None:
+            path = chance.choice(images if images and chance.random() < 0.3 else others)
+            data = originals[path]
+            path.write_bytes(spoilt(path, data, chance))
+            try:
+                capture = read_capture(root, axes=chance.choice(["auto", "opengl"]))
+                check_capture(capture, root)
+                for frames in capture.splits.values() if decode else ():
+                    load_frames([frame for frame in frames if frame.image], resolution=chance.choice([None, 4]))
+            finally:
+                path.write_bytes(data)
+
+        return read
+
+    return make
+
+
+def spoilt(path: Path, data: bytes, chance: random.Random) -> bytes:
+    """A file's bytes, changed in a way that its kind invites."""
+    if path.suffix == ".json" and chance.random() < 0.75:
+        value = json.loads(data)
+        for _ in range(chance.choice([1, 1, 2])):
+            value = mutate_json(value, chance)
+        return json.dumps(value).encode()
+    if path.suffix == ".png" and chance.random() < 0.6:
+        return mutate_png(data, chance)
+    if path.suffix in (".bin", ".npy", ".ply"):
+        return mutate_binary(data, chance)
+    return mutate_bytes(data, chance)
+
+
+def write_blender(root: Path) -> None:
+    """With a JPEG, a name without suffix, a mask and a test split."""
+    data_folders.write_blender(root)
+    fields = json.loads((root / "transforms_train.json").read_text())
+    Image.open(root / "train/0002.png").convert("RGB").save(root / "train/0002.jpg")
+    fields["frames"][2]["file_path"] = "train/0002.jpg"
+    fields["frames"][1]["file_path"] = "./train/0001"
+    fields["frames"][0]["mask_path"] = "train/0003.png"
+    (root / "transforms_train.json").write_text(json.dumps(fields))
+    (root / "transforms_test.json").write_text(json.dumps({**fields, "frames": fields["frames"][:2]}))
+
+
+def write_transforms(root: Path) -> None:
+    """With sparse points, masks, lists of names and a lens."""
+    data_folders.write_transforms(root)
+    fields = json.loads((root / "transforms.json").read_text())
+    fields |= {"k1": 0.01, "p1": 0.001, "ply_file_path": "points.ply", "up": [0, 0, 1], "applied_transform": [[1, 0]]}
+    fields["train_filenames"] = [frame["file_path"] for frame in fields["frames"]]
+    fields["frames"][0]["mask_path"] = "images/0001.png"
+    (root / "transforms.json").write_text(json.dumps(fields))
+    points = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n" + b"property double x\n"
+    points += b"property double y\nproperty double z\nproperty uchar red\nend_header\n"
+    (root / "points.ply").write_bytes(points + struct.pack("<3dB3dB", 0.5, 1, 2, 3, 4, 5, 6, 7))
+
+
+def write_nerfies(root: Path) -> None:
+    """With points and what DyCheck adds."""
+    data_folders.write_nerfies(root)
+    np.save(root / "points.npy", data_folders.POINTS)
+    (root / "extra.json").write_text(json.dumps({"up": [0, 0, 1], "fps": 30}))
 
 
 def mutate_tensors(tensors: dict[str, torch.Tensor], chance: random.Random) -> dict[str, torch.Tensor]:
@@ -237,7 +321,13 @@ def config(folder: Path) -> Reader:
     return read
 
 
-READERS = {"data set": data_set, "checkpoint": checkpoint, "config": config}
+READERS = {
+    "checkpoint": checkpoint, "config": config, "blender": folder_of(write_blender),
+    "transforms": folder_of(write_transforms), "nerfies": folder_of(write_nerfies),
+    "llff": folder_of(data_folders.write_llff), "rig": folder_of(data_folders.write_rig, decode=False),
+    "colmap": folder_of(data_folders.write_colmap),
+    "colmap text": folder_of(partial(data_folders.write_colmap, binary=False)),
+}  # fmt: skip
 
 
 def read_spoilt(reader: Reader, chance: random.Random) -> str | None:
@@ -258,12 +348,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--readers", nargs="+", choices=sorted(READERS), default=sorted(READERS))
     given = parser.parse_args()
     import logging
 
     logging.disable(logging.WARNING)
     failures, slowest, begin = 0, 0.0, time.perf_counter()
-    names = sorted(READERS)
+    names = given.readers
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as place:
         readers = {name: READERS[name](Path(place) / name.replace(" ", "_")) for name in names}
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

@@ -149,10 +149,12 @@ def _is_even(model: str, coefficients: Coefficients, u: Tensor, v: Tensor) -> bo
 
 
 def _radius(model: str, coefficients: Coefficients, distorted: float) -> float:
-    """The radius up to which a lens does not fold, at most that which it puts at a distorted one."""
+    """The radius up to which a lens does not fold, at most one that it puts at a distorted one or beyond."""
     radii = torch.linspace(0, math.radians(MAX_DEGREES), NUM_RADII, dtype=torch.float64).tan()
     found = distort(model, (*coefficients[:6], 0.0, 0.0), radii, torch.zeros_like(radii))[0]
-    is_end = (found[1:] <= found[:-1]) | (found[:-1] >= distorted)
+    # Tangential terms move a position by at most this much, which may be inwards.
+    shifts = 3 * (abs(float(coefficients[6])) + abs(float(coefficients[7]))) * radii * radii
+    is_end = (found[1:] <= found[:-1]) | ((found - shifts)[:-1] >= distorted)
     return float(radii[int(is_end.int().argmax())] if bool(is_end.any()) else radii[-1])
 
 

@@ -1,7 +1,6 @@
 """Data sets: images with cameras and times, and where they come from."""
 
 from dnerf.data.folder import FolderData
-from dnerf.data.formats.legacy import load_blender
 from dnerf.data.formats.writers import save_blender, save_transforms
 from dnerf.data.frames import Frames, composite_on
 from dnerf.data.scene_record import SceneRecord, World
@@ -10,5 +9,5 @@ from dnerf.data.synthetic import random_views, render_exact, render_frames
 
 __all__ = [
     "SPLITS", "DataSource", "FolderData", "Frames", "SceneRecord", "SyntheticData", "World", "composite_on",
-    "load_blender", "random_views", "render_exact", "render_frames", "save_blender", "save_transforms",
+    "random_views", "render_exact", "render_frames", "save_blender", "save_transforms",
 ]  # fmt: skip

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from data_folders import frames_of
 from small_runs import Watch, small_frames, small_renderer, small_trainer
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from dnerf.core.backgrounds import ConstantBackground
 from dnerf.core.cameras import Camera, Intrinsics, look_at
 from dnerf.core.compositing import FieldOutput
 from dnerf.core.files import atomic_path, claimed, remove_leftovers, write_text
-from dnerf.data import load_blender, save_blender
+from dnerf.data import save_blender
 from dnerf.fields.base import RadianceField
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
@@ -167,9 +168,9 @@ def test_data_that_vanish_during_training_are_not_missed(tmp_path: Path) -> None
     save_blender({"train": small_frames(3)}, tmp_path / "scene")
     vanish = Watch(lambda run: shutil.rmtree(tmp_path / "scene", ignore_errors=True))
     made = small_trainer(num_steps=3, callbacks={"vanish": vanish})
-    assert made.fit(small_renderer(), load_blender(tmp_path / "scene", "train")).step == 3
+    assert made.fit(small_renderer(), frames_of(tmp_path / "scene", "train")).step == 3
     with pytest.raises(ValueError, match="root must be a data set's folder"):
-        load_blender(tmp_path / "scene", "train")
+        frames_of(tmp_path / "scene", "train")
 
 
 def test_an_output_folder_that_vanishes_comes_back(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

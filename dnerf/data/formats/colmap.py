@@ -110,10 +110,10 @@ def _image_folder(folder: Folder, names: Sequence[str]) -> str:
 def _pose(image: RegisteredImage, where: str) -> Pose:
     """Camera to world of a quaternion and translation that map world to camera."""
     values = np.array([*image.quaternion, *image.translation])
-    length = float(np.linalg.norm(values[:4]))
-    if not bool((np.abs(values) <= MAX_NUMBER).all()) or not length > 1e-6:
+    bounded = bool((np.abs(values) <= MAX_NUMBER).all())  # false of NaN
+    if not bounded or not np.linalg.norm(values[:4]) > 1e-6:
         raise ValueError(f"{where}: quaternion and translation must be finite, got {short(values.tolist())}")
-    w, x, y, z = values[:4] / length
+    w, x, y, z = values[:4] / np.linalg.norm(values[:4])
     rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

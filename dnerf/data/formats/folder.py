@@ -11,6 +11,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".MP4", ".MOV", ".AVI")
 REDUCED = ("images_2", "images_4", "images_8")  # what COLMAP's and nerfstudio's tools write beside images/
 MAX_PARTS = 64
+MAX_NAME_BYTES = 255  # what file systems allow
 
 
 class Folder:
@@ -37,6 +38,8 @@ class Folder:
         """
         value = text(name, where)
         parts, outside = self._parts(value)
+        if any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in parts):
+            raise ValueError(f"{where} must have names of at most {MAX_NAME_BYTES} bytes, got {short(value)}")
         for start in range(len(parts)) if outside else (0,):
             path = self._existing("/".join(parts[start:]), where)
             if path is not None:
@@ -100,7 +103,7 @@ class Folder:
             return None
         suffix = next((s for s in IMAGE_SUFFIXES if name.endswith(s)), "")
         stem = name.removesuffix(suffix)
-        for candidate in [name] * bool(suffix) + [name + s for s in IMAGE_SUFFIXES]:
+        for candidate in [name, *(name + s for s in IMAGE_SUFFIXES)]:
             if os.path.isfile(self.root / candidate):
                 return self.inside(self.root / candidate, where)
         for other in IMAGE_SUFFIXES if suffix else ():

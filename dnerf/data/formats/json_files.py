@@ -13,6 +13,7 @@ import numpy as np
 MAX_BYTES = 16 * 2**20
 MAX_FRAMES = 10_000
 MAX_NOTES = 100
+MAX_LETTERS = 1000
 MAX_NUMBER = 1e9  # keeps sums of squares finite in float32; real scenes lie within thousands
 
 
@@ -112,7 +113,7 @@ def matrix(value: Any, where: str, shapes: tuple[tuple[int, int], ...]) -> np.nd
 
 
 def text(value: Any, where: str) -> str:
-    """Printable text of at most 4096 letters."""
-    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 4096:
+    """Printable text of at most 1000 letters, which is short enough for a path."""
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= MAX_LETTERS:
         raise ValueError(f"{where} must be printable text, got {short(value)}")
     return value

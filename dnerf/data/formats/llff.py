@@ -19,6 +19,7 @@ from dnerf.data.formats.manifest_cameras import MAX_FOCAL_RATIO, MAX_SIDE
 from dnerf.data.formats.names import frame_numbers
 from dnerf.data.formats.points import read_npy
 from dnerf.data.formats.poses import rigid_pose
+from dnerf.data.videos import read_video_header
 
 MAX_BYTES = 2**24
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
@@ -69,8 +70,7 @@ def read(root: Path) -> Capture:
 
 
 def _name(folder: Folder, image: ImageFile) -> str:
-    name = folder.name(image.path)
-    return name if image.frame is None else f"{name}/{image.frame:05d}"
+    return folder.name(image.path) if image.frame is None else f"{image.path.stem}/{image.frame:05d}"
 
 
 def _images(folder: Folder, num_cameras: int) -> list[Images]:
@@ -115,8 +115,6 @@ def _numbered(folder: Folder, paths: Sequence[Path], *, by_order: bool) -> Image
 
 
 def _num_frames(path: Path) -> int:
-    from dnerf.data.videos import read_video_header
-
     found = read_video_header(path).num_frames
     if not 0 < found <= MAX_FRAMES or not math.isfinite(found):
         raise ValueError(f"{path}: video must have 1 to {MAX_FRAMES} frames, got {found}; cut it, or export fewer")

@@ -13,6 +13,9 @@ from dnerf.data.formats.keys import COEFFICIENTS, MATRIX_KEYS
 
 ANGLES = (1e-3, 3.14)
 MAX_FOCAL_RATIO = 1e4
+# A focal length below both is no pinhole's in pixels (a view of 170 degrees), but looks like one in widths.
+MIN_FOCAL_RATIO = 0.04
+MAX_SHARE = 10.0
 MAX_SIDE = 2**17
 MAX_COEFFICIENT = 1e4
 MAX_SKEW = 1e-3  # of the focal length: a hundredth of a pixel in most images
@@ -150,17 +153,16 @@ def _focal_lengths(
     fields: Mapping[str, Any], place: str, width: int, height: int
 ) -> tuple[float, float, float | None, float | None] | None:
     """Focal lengths, and the principal point where a matrix has it; None if these fields have no focal length."""
-    across, along = ((size / MAX_FOCAL_RATIO, size * MAX_FOCAL_RATIO) for size in (width, height))
     for key in MATRIX_KEYS:
         if fields.get(key) is not None:
-            return _of_matrix(fields[key], f"{place}{key}", across, along)
-    focal_y = None if fields.get("fl_y") is None else number(fields["fl_y"], f"{place}fl_y", *along)
+            return _of_matrix(fields[key], f"{place}{key}", width, height)
+    focal_y = None if fields.get("fl_y") is None else _in_pixels(fields["fl_y"], f"{place}fl_y", height)
     if focal_y is None and fields.get("camera_angle_y") is not None:
-        focal_y = 0.5 * height / math.tan(0.5 * number(fields["camera_angle_y"], f"{place}camera_angle_y", *ANGLES))
+        focal_y = _of_angle(fields["camera_angle_y"], f"{place}camera_angle_y", height)
     if fields.get("fl_x") is not None:
-        focal_x = number(fields["fl_x"], f"{place}fl_x", *across)
+        focal_x = _in_pixels(fields["fl_x"], f"{place}fl_x", width)
     elif fields.get("camera_angle_x") is not None:
-        focal_x = 0.5 * width / math.tan(0.5 * number(fields["camera_angle_x"], f"{place}camera_angle_x", *ANGLES))
+        focal_x = _of_angle(fields["camera_angle_x"], f"{place}camera_angle_x", width)
     elif focal_y is not None:
         focal_x = focal_y
     else:
@@ -168,13 +170,26 @@ def _focal_lengths(
     return focal_x, focal_x if focal_y is None else focal_y, None, None
 
 
-def _of_matrix(
-    value: Any, place: str, across: tuple[float, float], along: tuple[float, float]
-) -> tuple[float, float, float, float]:
+def _in_pixels(value: Any, place: str, size: int) -> float:
+    focal = number(value, place, size / MAX_FOCAL_RATIO, size * MAX_FOCAL_RATIO)
+    if focal < min(MAX_SHARE, MIN_FOCAL_RATIO * size):
+        raise ValueError(
+            f"{place} must be in pixels of images {size} across, got {focal:g}; multiply it by {size} if it is a share"
+        )
+    return focal
+
+
+def _of_angle(value: Any, place: str, size: int) -> float:
+    if isinstance(value, int | float) and ANGLES[1] < value < 180:
+        raise ValueError(f"{place} must be in radians, below pi, got {value:g}; that may be {math.radians(value):.6g}")
+    return 0.5 * size / math.tan(0.5 * number(value, place, *ANGLES))
+
+
+def _of_matrix(value: Any, place: str, width: int, height: int) -> tuple[float, float, float, float]:
     """Focal lengths and principal point of a camera matrix."""
     values = matrix(value, place, ((3, 3), (3, 4), (4, 4)))
-    focal_x = number(float(values[0, 0]), f"{place}[0][0]", *across)
-    focal_y = number(float(values[1, 1]), f"{place}[1][1]", *along)
+    focal_x = _in_pixels(float(values[0, 0]), f"{place}[0][0]", width)
+    focal_y = _in_pixels(float(values[1, 1]), f"{place}[1][1]", height)
     if abs(values[0, 1]) > MAX_SKEW * focal_x:
         raise ValueError(f"{place}[0][1] must be 0, got {values[0, 1]:g}: pixels without skew are supported only")
     if values[1, 0] or values[2, :3].tolist() != [0, 0, 1]:

@@ -60,7 +60,9 @@ def read(root: Path) -> Capture:
     cameras = {name: _camera(root / "camera" / f"{name}.json", notes) for name in ids}
     splits = {
         split: tuple(
-            CaptureFrame(name, *cameras[name], ImageFile(images / f"{name}{suffix}"), None, times[name])
+            CaptureFrame(
+                name, *cameras[name], ImageFile(folder.inside(images / f"{name}{suffix}", name)), None, times[name]
+            )
             for name in names
         )
         for split, names in ids_by_split.items()

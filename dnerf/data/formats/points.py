@@ -91,12 +91,12 @@ def read_ply(path: Path) -> Tensor | None:
 def _ascii_rows(path: Path, data: bytes, count: int, width: int) -> np.ndarray:
     """The first rows of text, as many as are kept at most."""
     file, rows = io.BytesIO(data), []
-    for _ in range(min(count, MAX_POINTS)):
-        words = file.readline(MAX_HEADER).split()
+    for index in range(min(count, MAX_POINTS)):
         try:
-            rows.append([float(word) for word in words])
+            row = [float(word) for word in file.readline(MAX_HEADER).split()]
         except ValueError:
-            words = []
-        if len(words) != width:
-            raise ValueError(f"{path}: vertices must be {count} lines of {width} numbers, line {len(rows)} is not")
+            row = []
+        if len(row) != width:
+            raise ValueError(f"{path}: vertices must be {count} lines of {width} numbers, line {index + 1} is not")
+        rows.append(row)
     return np.array(rows).reshape(-1, width)

@@ -1,5 +1,6 @@
 """Fixed cameras with a video each and `info.json`: ScalarFlow's smoke (Eckert et al. 2019) as HyFluid packs it."""
 
+from dataclasses import replace
 from pathlib import Path
 from reprlib import repr as short
 from typing import Any
@@ -8,9 +9,10 @@ from dnerf.data.capture import Capture, CaptureFrame, ImageFile
 from dnerf.data.formats.folder import Folder
 from dnerf.data.formats.json_files import MAX_FRAMES, Notes, matrix, number, numbers, read_object, required, text, whole
 from dnerf.data.formats.keys import LENS_KEYS
-from dnerf.data.formats.manifest import color
+from dnerf.data.formats.manifest import color, unique
 from dnerf.data.formats.manifest_cameras import MAX_SIDE, LensFields
 from dnerf.data.formats.poses import from_opencv, rigid_pose
+from dnerf.data.videos import read_video_header
 
 SPLITS = {"train": "train_videos", "test": "test_videos"}
 KNOWN = LENS_KEYS | {
@@ -53,7 +55,8 @@ def read(root: Path, *, opencv: bool = False) -> Capture:
             frames += _frames(folder, video, fields, f"{path}: {key}[{index}]", opencv, left - len(frames))
         left -= len(frames)
         if frames:
-            splits[split] = tuple(frames)
+            names = unique([frame.name for frame in frames])
+            splits[split] = tuple(replace(frame, name=name) for name, frame in zip(names, frames))
     if "train" not in splits:
         raise ValueError(f"{path}: train_videos must name at least one video, got none")
     _note_unknown(fields, notes)
@@ -75,8 +78,6 @@ def _frames(
         raise ValueError(f"{where}.file_name: no video {path}; put it there, or remove it from the list")
     stated = [video.get(key) for key in ("frame_num", "frame_rate", "camera_hw")]
     if None in stated:
-        from dnerf.data.videos import read_video_header
-
         header = read_video_header(path)
         stated = [
             found if value is None else value
