@@ -25,7 +25,7 @@ def understood(word: str) -> object:
     "path",
     [
         "my scenes/lego (1)", "a=b#c", "it's", 'the "best"', "[new]", "{x: 1}", "数据/场景", "C:\\data\\x\\", "2024",
-        "1e5",        "true", "null_island", "a,b", "$HOME", "50%", "a\\'b", "-lead", "*", "a;b|c&d", "./runs/x", "../x",
+        "1e5", "true", "null_island", "a,b", "$HOME", "50%", "a\\'b", "-lead", "*", "a;b|c&d", "./runs/x", "../x",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("key", ["data.root", "out_dir", "run", "+data_root"])
