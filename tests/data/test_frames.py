@@ -1,5 +1,6 @@
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,7 +8,9 @@ import torch
 from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics, look_at
+from dnerf.core.lenses import Distortion
 from dnerf.data.frames import Frames, composite_on, is_rigid
+from dnerf.data.pixel_layout import PixelLayout
 
 INTRINSICS = Intrinsics(5, 4, 6.0, 7.0)
 
@@ -91,6 +94,100 @@ def test_pixels_are_those_of_each_frames_camera(pixel_origin: str) -> None:
         assert torch.equal(rgba[position], frames.images[frame, row, column].float() / 255)
 
 
+LENSES = {
+    "sizes": tuple(Intrinsics(width, height, 6.0, 7.0) for width, height in ((5, 4), (3, 7), (5, 4), (1, 1))),
+    "focal lengths": tuple(Intrinsics(5, 4, 6.0 + i, 7.0, 2.5 - 0.3 * i) for i in range(4)),
+    "lenses": (
+        Intrinsics(5, 4, 6.0, 7.0, distortion=Distortion("opencv", (-0.2,), (0.01, 0.02))),
+        Intrinsics(7, 3, 6.0, 7.0, distortion=Distortion("fisheye", (0.05,))),
+        Intrinsics(5, 4, 6.0, 7.0),
+        Intrinsics(5, 4, 6.0, 7.0, pixel_origin="corner", distortion=Distortion("opencv", (0.3,))),
+    ),
+    "one lens": (Intrinsics(5, 4, 6.0, 7.0, distortion=Distortion("opencv", (-0.2,))),) * 4,
+}  # fmt: skip
+
+
+def frames_of(intrinsics: tuple[Intrinsics, ...], channels: int = 4) -> tuple[Frames, list[Frames]]:
+    """Frames, and each of them alone."""
+    generator = torch.Generator().manual_seed(2)
+    images = [
+        torch.randint(0, 256, (1, lens.height, lens.width, channels), generator=generator, dtype=torch.uint8)
+        for lens in intrinsics
+    ]
+    poses = torch.stack([look_at((3.0, i + 0.5, 2.0)) for i in range(len(images))])
+    times, planes = torch.linspace(0, 1, len(images)), {"near": 1.0, "far": 3.0}
+    alone = [
+        Frames(image, poses[i, None], times[i, None], lens, **planes)
+        for i, (image, lens) in enumerate(zip(images, intrinsics))
+    ]
+    is_shared = len({image.shape for image in images}) == 1
+    together = torch.cat(images) if is_shared else torch.cat([image.flatten(0, 2) for image in images])
+    return Frames(together, poses, times, intrinsics, **planes), alone
+
+
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("channels", [3, 4])
+def test_frames_of_other_sizes_and_lenses_are_those_of_each_camera_alone(name: str, channels: int) -> None:
+    frames, alone = frames_of(LENSES[name], channels)
+    assert frames.num_pixels == sum(each.num_pixels for each in alone)
+    assert (frames.shared_intrinsics is None) == (name != "one lens")
+    assert frames.intrinsics == LENSES[name]
+    order = torch.randperm(frames.num_pixels, generator=torch.Generator().manual_seed(0))
+    rays, rgba = frames.pixels(order)
+    places = torch.empty_like(order)
+    places[order] = torch.arange(len(order))
+    start = 0
+    for i, each in enumerate(alone):
+        assert torch.equal(frames.stored_image(i), each.images[0])
+        assert torch.equal(frames.image(i, (0.1, 0.2, 0.3)), each.image(0, (0.1, 0.2, 0.3)))
+        own_rays, own_rgba = each.pixels(torch.arange(each.num_pixels))
+        chosen = places[start : start + each.num_pixels]
+        assert torch.equal(rgba[chosen], own_rgba)
+        for name in ("origins", "directions", "times", "near", "far"):
+            # In float64 many lenses are undone by as many steps as the worst wants: one rounding apart at most.
+            torch.testing.assert_close(getattr(rays, name)[chosen], getattr(own_rays, name), rtol=2e-7, atol=2e-7)
+        start += each.num_pixels
+
+
+def test_pixels_of_many_pinholes_have_the_bits_of_each() -> None:
+    frames, alone = frames_of(LENSES["focal lengths"])
+    rays, _ = frames.pixels(torch.arange(80))
+    for name in ("origins", "directions", "times", "near", "far"):
+        each = [getattr(own.pixels(torch.arange(20))[0], name) for own in alone]
+        assert torch.equal(getattr(rays, name), torch.cat(each))
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_subsets_of_other_sizes_and_lenses_are_theirs(name: str) -> None:
+    frames, alone = frames_of(LENSES[name])
+    for rows in ([2, 0], [1], [-1, 1, 1]):
+        part = frames.subset(rows)
+        assert len(part) == len(rows)
+        for i, row in enumerate(rows):
+            assert torch.equal(part.stored_image(i), alone[row].images[0])
+            assert part.intrinsics[i] == LENSES[name][row]
+            assert torch.equal(part.poses[i], frames.poses[row])
+    again = replace(frames, far=9.0).to("cpu")
+    assert again.intrinsics == frames.intrinsics
+    assert again.camera(1).far == 9.0
+    assert torch.equal(again.images, frames.images)
+
+
+def test_equal_intrinsics_are_stored_once() -> None:
+    frames, _ = frames_of(tuple(Intrinsics(5, 4, 6.0 + i % 2, 7.0) for i in range(6)))
+    assert len({id(lens) for lens in frames.intrinsics}) == 2
+    assert make_frames().intrinsics == (INTRINSICS,) * 3
+
+
+def test_every_number_of_a_pixel_is_its_frame_row_and_column_and_back() -> None:
+    layout = PixelLayout([(2, 3), (1, 4), (3, 1)], torch.device("cpu"))
+    expected = [(f, r, c) for f, (h, w) in enumerate(layout.sizes) for r in range(h) for c in range(w)]
+    located = layout.locate(torch.arange(13))
+    assert torch.stack(located, -1).tolist() == [list(each) for each in expected]
+    assert layout.index(*located).tolist() == list(range(13))
+    assert [side.tolist() for side in layout.sides(torch.tensor([2, 0]))] == [[3, 2], [1, 3]]
+
+
 def test_pixels_of_no_index_are_no_rays_and_there_are_so_many() -> None:
     frames = make_frames()
     rays, rgba = frames.pixels(torch.empty(0, dtype=torch.int64))
@@ -159,6 +256,11 @@ def bad_pose(**entries: float) -> Tensor:
         ({"near": 6.0, "far": 2.0}, "near and far"),
         ({"background": "white"}, "background must be None"),
         ({"names": ("a",)}, "names must be 3"),
+        ({"intrinsics": (INTRINSICS,) * 2}, "intrinsics must be one, or 3 as there are times, got 2"),
+        (
+            {"intrinsics": (INTRINSICS, INTRINSICS, Intrinsics(4, 4, 6.0, 7.0))},
+            r"images must have shape \(56, 3 or 4\)",
+        ),
         ({"channels": 3, "background": "pink"}, "color must be"),
     ],
 )

@@ -59,6 +59,46 @@ def test_any_sampler_draws_pixels_that_there_are_and_of_frames_that_are_in(
     assert torch.all(draw(pixels, 30) < frames(2).num_pixels)
 
 
+def uneven_frames() -> Frames:
+    """Frames of 4 x 5, 9 x 2, 1 x 1 and 3 x 8 pixels."""
+    lenses = [Intrinsics(width, height, 10.0, 10.0) for height, width in ((4, 5), (9, 2), (1, 1), (3, 8))]
+    images = torch.zeros(20 + 18 + 1 + 24, 4, dtype=torch.uint8)
+    return Frames(images, torch.eye(4).repeat(4, 1, 1), torch.linspace(0, 1, 4), lenses)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("progress", [0.0, 0.2, 1.0])
+def test_all_pixels_of_frames_of_different_sizes_are_drawn_alike(name: str, progress: float) -> None:
+    images, pixels = uneven_frames(), SAMPLERS[name]()
+    pixels.begin(images)
+    inner = pixels.pixels if isinstance(pixels, ErrorGuidedPixels) else pixels
+    chosen = inner.frames_in(progress) if isinstance(inner, TemporalCurriculum) else None
+    frames_in = set(range(4)) if chosen is None else set(chosen.tolist())
+    starts = images.layout.starts
+    expected = {p for i in frames_in for p in range(starts[i], starts[i + 1])}
+    drawn = draw(pixels, 6000, progress)
+    assert set(drawn.tolist()) == expected
+    if name in ("uniform", "curriculum"):
+        # Five standard deviations of a count.
+        counts = torch.bincount(drawn, minlength=63)[sorted(expected)] / 6000
+        assert (counts - 1 / len(expected)).abs().max() < 5 * (1 / len(expected) / 6000) ** 0.5
+
+
+def test_errors_are_known_of_blocks_of_frames_of_different_sizes() -> None:
+    images = uneven_frames()
+    pixels = guided(images, resolution=3)  # blocks of 3 x 3
+    assert pixels.errors.shape == (4, 3, 3)
+    inside = [(2, 2), (3, 1), (1, 1), (1, 3)]
+    expected = torch.zeros(4, 3, 3)
+    for i, (rows, columns) in enumerate(inside):
+        expected[i, :rows, :columns] = UNKNOWN
+    assert torch.equal(pixels.errors, expected)
+    # Row 7, column 1 of the second frame, and row 0, column 7 of the last.
+    pixels.feedback(torch.tensor([20 + 15, 39 + 7]), torch.tensor([0.25, 0.5]))
+    expected[1, 2, 0], expected[3, 0, 2] = 0.25, 0.5
+    assert torch.equal(pixels.errors, expected)
+
+
 def seen(window: TemporalCurriculum, times: list[float], progress: float) -> set[float]:
     window.begin(frames(len(times), times=times))
     return {times[i] for i in (draw(window, 2000, progress) // 48).tolist()}
