@@ -152,11 +152,16 @@ class FolderData(DataSource):
         stated = self.capture.up
         if stated is None and self.capture.format == "blender":
             stated = Z_UP  # Blender's, where cameras do not say otherwise
-        given = replace(self.given, up=stated, planes=self.capture.planes, points=self.capture.points)
+        points = self.capture.points
+        if points is not None and not bool(points.isfinite().all(-1).any()):
+            points = None
+        given = replace(self.given, up=stated, planes=self.capture.planes, points=points)
         world = place(
             lambda poses, planes: self._made(loaded, poses, planes), _poses(loaded.frames), loaded.intrinsics, given
         )
-        notes = (*self.capture.notes, *self._split.notes, *loaded.notes, *world.notes)
+        counts = ", ".join(f"{len(frames)} {split}" for split, frames in self._split.splits.items())
+        read = f"{self.capture.path}: read as {self.capture.format}, {counts} frames"
+        notes = (read, *self.capture.notes, *self._split.notes, *loaded.notes, *world.notes)
         return replace(world, clock=self._split.clock, has_alpha=loaded.has_alpha, notes=notes)
 
     def _made(self, loaded: LoadedFrames, poses: Tensor, planes: tuple[float, float]) -> Frames:
