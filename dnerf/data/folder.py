@@ -97,7 +97,7 @@ class FolderData(DataSource):
         frames = self._made(loaded, poses, planes_between(poses, world))
         if world.has_alpha and not frames.has_alpha and frames.background is None:
             frames = self._on_its_background(frames, split)
-        return self._known(frames, split)
+        return frames
 
     def world(self) -> World:
         """How the training frames are placed in the world: as settled, or found from them."""
@@ -115,7 +115,7 @@ class FolderData(DataSource):
         similarity, result = self.world().similarity, {}
         for split, frames in self._split.splits.items():
             have_images = any(frame.image is not None for frame in frames)
-            kept = [frame for frame in frames if split != "train" or self._is_learnt(frame)]
+            kept = [frame for frame in self._read_of(split) if _is_there(frame)] if split == "train" else frames
             shared: dict[Intrinsics, Intrinsics] = {}
             lenses = (self._lens(final_intrinsics(frame, self.resolution)) for frame in kept)
             result[split] = CameraSet(
@@ -140,13 +140,17 @@ class FolderData(DataSource):
                 "be filmed (render.py path=test), not scored; evaluate_split=null scores none"
             )
 
-    def _is_learnt(self, frame: CaptureFrame) -> bool:
-        has_image = frame.image is not None and frame.image.path.exists()
-        return has_image and (self.train_end is None or bool(_times([frame])[0] <= self.train_end))
+    def _read_of(self, split: str) -> list[CaptureFrame]:
+        """The frames of a split that have an image; of training, up to `train_end`: nothing else is looked at."""
+        frames = [frame for frame in self._split.splits[split] if frame.image is not None]
+        if split == "train" and self.train_end is not None:
+            frames = [frame for frame in frames if bool(_times([frame])[0] <= self.train_end)]
+            if not frames:
+                raise ValueError(f"train_end must leave a training frame, got {self.train_end}, the first is later")
+        return frames
 
     def _load(self, split: str) -> LoadedFrames:
-        frames = [frame for frame in self._split.splits[split] if frame.image is not None]
-        return load_frames(frames, resolution=self.resolution)
+        return load_frames(self._read_of(split), resolution=self.resolution)
 
     def _placed(self, loaded: LoadedFrames) -> World:
         stated = self.capture.up
@@ -183,6 +187,10 @@ class FolderData(DataSource):
             )
         red, green, blue = color.tolist()
         return replace(frames, background=(red, green, blue))
+
+
+def _is_there(frame: CaptureFrame) -> bool:
+    return frame.image is not None and frame.image.path.exists()
 
 
 def _poses(frames: Sequence[CaptureFrame]) -> Tensor:
