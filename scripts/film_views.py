@@ -59,7 +59,7 @@ Path = tuple[Tensor, list[Intrinsics], list[float] | None]  # poses, lenses and 
 
 
 def _around(config: DictConfig, scene: SceneRecord) -> Path:
-    path, around = config.path, Surroundings.of(scene.cameras["train"])
+    path, around = config.path, _followed(config, scene)
     target, radius = _target(path, scene), _length(path.radius, scene)
     if path.name == "orbit":
         elevations = (around.elevation,) * 2 if path.elevation is None else (math.radians(path.elevation),) * 2
@@ -89,7 +89,7 @@ def _fixed(config: DictConfig, scene: SceneRecord) -> Path:
             raise ValueError(f"path.frame must be in 0..{len(cameras) - 1}, got {path.frame}")
         pose, lens = cameras.poses[path.frame], cameras.intrinsics[path.frame]
     else:
-        around = Surroundings.of(scene.cameras["train"])
+        around = _followed(config, scene)
         target, radius = _target(path, scene), _length(path.radius, scene)
         pose, lens = (
             pose_around(
@@ -109,7 +109,7 @@ def _own_cameras(config: DictConfig, scene: SceneRecord) -> Path:
 
 
 def _key_frames(config: DictConfig, scene: SceneRecord) -> Path:
-    around = Surroundings.of(scene.cameras["train"])
+    around = _followed(config, scene)
     keys = read_key_frames(config.path.file).in_world(scene.world.similarity)
     placed = {"target": around.target, "radius": (around.radius,), "elevation": (math.degrees(around.elevation),)}
     try:
@@ -129,10 +129,15 @@ def _nerfstudio(config: DictConfig, scene: SceneRecord) -> Path:
     if isinstance(config.resolution, ListConfig):
         width, height = config.resolution
     else:
-        width = config.resolution or Surroundings.of(scene.cameras["train"]).intrinsics.width
+        width = config.resolution or _followed(config, scene).intrinsics.width
         height = max(1, round(width / path.aspect))
     poses = scene.world.similarity.poses_to_world(path.poses)
     return poses, path.intrinsics(width, height), None if path.times is None else list(path.times)
+
+
+def _followed(config: DictConfig, scene: SceneRecord) -> Surroundings:
+    """Where the cameras stand from which a film takes what the settings leave open."""
+    return Surroundings.of(scene.split(config.path.split or "train")[1])
 
 
 def _target(path: DictConfig, scene: SceneRecord) -> list[float] | None:

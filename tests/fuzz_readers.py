@@ -33,13 +33,18 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "scripts")]
 import data_folders  # noqa: E402
 from small_runs import run_of, small_renderer  # noqa: E402
 
+from dnerf.core.cameras import Intrinsics  # noqa: E402
+from dnerf.core.lenses import Distortion  # noqa: E402
+from dnerf.data import FolderData  # noqa: E402
 from dnerf.data.capture import Capture  # noqa: E402
 from dnerf.data.formats import read_capture  # noqa: E402
 from dnerf.data.loading import load_frames  # noqa: E402
+from dnerf.data.scene_record import CameraSet, SceneRecord, World  # noqa: E402
 from dnerf.training.checkpoint import encode_run, max_bytes, restore_run  # noqa: E402
 from dnerf.training.checkpoint_folder import CheckpointFolder  # noqa: E402
 from dnerf.training.runs import load_config  # noqa: E402
 from dnerf.training.tensor_files import decode, encode, load_weights, save_weights  # noqa: E402
+from dnerf.visualization import read_nerfstudio_path  # noqa: E402
 
 MAX_SECONDS = 5.0
 MAX_MEMORY = 2**30
@@ -188,6 +193,10 @@ def folder_of(write: Callable[[Path], object], *, decode: bool = True) -> Callab
                 check_capture(capture, root)
                 for frames in capture.splits.values() if decode else ():
                     load_frames([frame for frame in frames if frame.image], resolution=chance.choice([None, 4]))
+                if decode:
+                    source = FolderData(root, chance.choice([None, 4]), axes="opengl")
+                    assert bool(source.frames("train").poses.isfinite().all())
+                    source.record()
             finally:
                 path.write_bytes(data)
 
@@ -301,6 +310,31 @@ def checkpoint(folder: Path) -> Reader:
     return read
 
 
+def record(folder: Path) -> Reader:
+    """What a run keeps of its data set, and a camera path."""
+    folder.mkdir(parents=True)
+    poses = torch.from_numpy(data_folders.poses()).float()
+    lens = Intrinsics(8, 6, 9.5, 9.5, distortion=Distortion(radial=(0.01,)))
+    world = World(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
+    SceneRecord(world, {"train": CameraSet(poses, torch.zeros(4), (lens,) * 4, tuple("abcd"))}).write(folder)
+    frames = [{"camera_to_world": pose.flatten().tolist(), "fov": 50, "render_time": 0.5} for pose in poses]
+    path = {"camera_type": "perspective", "render_width": 8, "render_height": 6, "camera_path": frames}
+    (folder / "path.json").write_text(json.dumps(path))
+    (folder / "transforms.json").write_text(json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 0.5}))
+    originals = {file: file.read_bytes() for file in sorted(folder.iterdir())}
+
+    def read(chance: random.Random) -> None:
+        file = chance.choice(list(originals))
+        file.write_bytes(spoilt(file, originals[file], chance))
+        try:
+            SceneRecord.read(folder)
+            read_nerfstudio_path(folder / "path.json", folder / "transforms.json")
+        finally:
+            file.write_bytes(originals[file])
+
+    return read
+
+
 def config(folder: Path) -> Reader:
     """The config of a run."""
     import yaml
@@ -322,7 +356,7 @@ def config(folder: Path) -> Reader:
 
 
 READERS = {
-    "checkpoint": checkpoint, "config": config, "blender": folder_of(write_blender),
+    "checkpoint": checkpoint, "config": config, "record": record, "blender": folder_of(write_blender),
     "transforms": folder_of(write_transforms), "nerfies": folder_of(write_nerfies),
     "llff": folder_of(data_folders.write_llff), "rig": folder_of(data_folders.write_rig, decode=False),
     "colmap": folder_of(data_folders.write_colmap),

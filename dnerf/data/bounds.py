@@ -135,14 +135,15 @@ def check_views(frames: Frames, box: Tensor, similarity: Similarity = IDENTITY) 
     )
 
 
-def opaque_without_room(frames: Frames, box: Tensor) -> float:
+def opaque_without_room(frames: Frames, box: Tensor, behind: Tensor | None = None) -> float:
     """The share of opaque pixels whose rays miss the box (2, 3) between the planes: nothing can explain them.
 
-    Images have alpha. One of `EVERY_PIXEL` squared pixels of each view is looked at.
+    Images have alpha, or a colour (3,) in [0, 1] behind them. One of `EVERY_PIXEL` squared pixels of each view is
+    looked at.
     """
     count = missed = 0
     for index in range(len(frames)):
-        rays = opaque_rays(frames, index)
+        rays = opaque_rays(frames, index, behind)
         enter, leave = ray_box(rays.origins, rays.directions, box.to(rays.origins))
         missed += int((enter.maximum(rays.near) >= leave.minimum(rays.far)).sum())
         count += len(rays)

@@ -97,7 +97,7 @@ class FolderData(DataSource):
         frames = self._made(loaded, poses, planes_between(poses, world))
         if world.has_alpha and not frames.has_alpha and frames.background is None:
             frames = self._on_its_background(frames, split)
-        return self._known(frames, split)
+        return frames
 
     def world(self) -> World:
         """How the training frames are placed in the world: as settled, or found from them."""
@@ -115,7 +115,7 @@ class FolderData(DataSource):
         similarity, result = self.world().similarity, {}
         for split, frames in self._split.splits.items():
             have_images = any(frame.image is not None for frame in frames)
-            kept = [frame for frame in frames if split != "train" or self._is_learnt(frame)]
+            kept = [frame for frame in self._read_of(split) if _is_there(frame)] if split == "train" else frames
             shared: dict[Intrinsics, Intrinsics] = {}
             lenses = (self._lens(final_intrinsics(frame, self.resolution)) for frame in kept)
             result[split] = CameraSet(
@@ -140,23 +140,32 @@ class FolderData(DataSource):
                 "be filmed (render.py path=test), not scored; evaluate_split=null scores none"
             )
 
-    def _is_learnt(self, frame: CaptureFrame) -> bool:
-        has_image = frame.image is not None and frame.image.path.exists()
-        return has_image and (self.train_end is None or bool(_times([frame])[0] <= self.train_end))
+    def _read_of(self, split: str) -> list[CaptureFrame]:
+        """The frames of a split that have an image; of training, up to `train_end`: nothing else is looked at."""
+        frames = [frame for frame in self._split.splits[split] if frame.image is not None]
+        if split == "train" and self.train_end is not None:
+            frames = [frame for frame in frames if bool(_times([frame])[0] <= self.train_end)]
+            if not frames:
+                raise ValueError(f"train_end must leave a training frame, got {self.train_end}, the first is later")
+        return frames
 
     def _load(self, split: str) -> LoadedFrames:
-        frames = [frame for frame in self._split.splits[split] if frame.image is not None]
-        return load_frames(frames, resolution=self.resolution)
+        return load_frames(self._read_of(split), resolution=self.resolution)
 
     def _placed(self, loaded: LoadedFrames) -> World:
         stated = self.capture.up
         if stated is None and self.capture.format == "blender":
             stated = Z_UP  # Blender's, where cameras do not say otherwise
-        given = replace(self.given, up=stated, planes=self.capture.planes, points=self.capture.points)
+        points = self.capture.points
+        if points is not None and not bool(points.isfinite().all(-1).any()):
+            points = None
+        given = replace(self.given, up=stated, planes=self.capture.planes, points=points)
         world = place(
             lambda poses, planes: self._made(loaded, poses, planes), _poses(loaded.frames), loaded.intrinsics, given
         )
-        notes = (*self.capture.notes, *self._split.notes, *loaded.notes, *world.notes)
+        counts = ", ".join(f"{len(frames)} {split}" for split, frames in self._split.splits.items())
+        read = f"{self.capture.path}: read as {self.capture.format}, {counts} frames"
+        notes = (read, *self.capture.notes, *self._split.notes, *loaded.notes, *world.notes)
         return replace(world, clock=self._split.clock, has_alpha=loaded.has_alpha, notes=notes)
 
     def _made(self, loaded: LoadedFrames, poses: Tensor, planes: tuple[float, float]) -> Frames:
@@ -178,6 +187,10 @@ class FolderData(DataSource):
             )
         red, green, blue = color.tolist()
         return replace(frames, background=(red, green, blue))
+
+
+def _is_there(frame: CaptureFrame) -> bool:
+    return frame.image is not None and frame.image.path.exists()
 
 
 def _poses(frames: Sequence[CaptureFrame]) -> Tensor:

@@ -66,11 +66,11 @@ def place(
     world_poses = similarity.poses_to_world(poses).float()
     frames = make_frames(world_poses, planes_between(world_poses, world))
     check_views(frames, torch.tensor(box), similarity)
-    unknown = unknown_parts(views, focus)
+    unknown = [*_unknown(views, focus), *_beside_focus(views, focus, given)]
     return replace(
         world,
         notes=(_about_box(world, frames, given), _about_planes(frames, world), f"up: {_short(up)}, {up_by}"),
-        warnings=(*_cut_off(frames, world, given, fitted), *([unknown] if unknown else [])),
+        warnings=(*_cut_off(frames, world, given, fitted), *unknown),
     )
 
 
@@ -169,11 +169,15 @@ def _about_planes(frames: Frames, world: World) -> str:
 
 
 def _cut_off(frames: Frames, world: World, given: Given, fitted: tuple[Similarity, Box]) -> list[str]:
-    """Where given settings leave out what images with alpha show, as sentences for warnings."""
-    if not frames.is_transparent:
+    """Where given settings leave out what the images show, as sentences for warnings.
+
+    Only images with alpha, or before one colour, tell.
+    """
+    behind = None if frames.is_transparent else background_color(frames)
+    if not frames.is_transparent and behind is None:
         return []
     said = []
-    share = opaque_without_room(frames, torch.tensor(world.box)) if given.box is not None else 0.0
+    share = opaque_without_room(frames, torch.tensor(world.box), behind) if given.box is not None else 0.0
     if share > WITHOUT_ROOM:
         corners = ",".join(_short(corner).replace(" ", "") for corner in fitted[0].box_from_world(fitted[1]).tolist())
         said.append(
@@ -199,6 +203,25 @@ def _cut_off(frames: Frames, world: World, given: Given, fitted: tuple[Similarit
             f"data.far={1.1 * last:.3g}, or null"
         )
     return said
+
+
+def _unknown(views: Viewpoints, focus: Tensor | None) -> list[str]:
+    said = unknown_parts(views, focus)
+    return [] if said is None else [said]
+
+
+def _beside_focus(views: Viewpoints, focus: Tensor | None, given: Given) -> list[str]:
+    """Whether what the cameras look at is before or behind the given planes, as a sentence for a warning."""
+    if focus is None:
+        return []
+    depth = float(depths_of(views, focus).median())
+    if given.near is not None and depth <= given.near:
+        place = f"lies behind what the cameras look at, in a depth of {depth:.3g}"
+        return [f"data.near={given.near:g} {place}: set it to null"]
+    if given.far is not None and depth >= given.far:
+        place = f"lies before what the cameras look at, in a depth of {depth:.3g}"
+        return [f"data.far={given.far:g} {place}: set it to null"]
+    return []
 
 
 def _short(values: Sequence[float]) -> str:

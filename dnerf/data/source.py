@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from numbers import Real
 
+import torch
 from torch import Tensor
 
 from dnerf.core.backgrounds import parse_color
@@ -64,11 +65,12 @@ class DataSource(ABC):
 
 
 def given_box(box: str | Sequence[Sequence[float]]) -> Tensor | None:
-    """Corners (2, 3) of a box, None for "auto"; ValueError for anything else."""
+    """Corners (2, 3) float64 of a box, None for "auto"; ValueError for anything else."""
     if isinstance(box, str):
         check_choice("box", box, ("auto",))
         return None
-    return as_box(box)
+    as_box(box)  # checks it
+    return torch.as_tensor(box, dtype=torch.float64)
 
 
 def as_corners(corners: Sequence[Sequence[float]]) -> Box:
@@ -148,7 +150,8 @@ class SyntheticData(DataSource):
                 box, by = _rounded(fit_box(self._train)), "fitted to the frames"
             else:
                 box, by = as_corners(self._box.tolist()), "as given"
-            note = f"box: {[list(corner) for corner in box]}, {by}"
+            shown = ", ".join("[" + ", ".join(f"{x:g}" for x in corner) + "]" for corner in box)
+            note = f"box: [{shown}], {by}"
             self._world = World(box, has_alpha=self.background is None, notes=(note,))
         return self._world
 

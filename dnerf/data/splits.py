@@ -42,9 +42,10 @@ def split_frames(capture: Capture, hold_out: int | None = 8, times: str = "auto"
         splits["test"] = splits["val"]
         notes.append("there is no test split: the validation frames are scored")
     elif "test" not in splits and hold_out is not None:
-        held = splits["train"][hold_out // 2 :: hold_out]  # neither the first nor the last: times between are scored
-        if held and len(held) < len(splits["train"]):
-            splits["train"] = tuple(frame for frame in splits["train"] if frame not in held)
+        frames = splits["train"]
+        held = frames[hold_out // 2 :: hold_out]  # neither the first nor the last: times between are scored
+        if held and len(held) < len(frames):
+            splits["train"] = tuple(frame for i, frame in enumerate(frames) if i % hold_out != hold_out // 2)
             splits["test"] = held
             notes.append(f"there is no test split: {_listed(held)} held out (data.hold_out={hold_out})")
     return SplitFrames(splits, clock, tuple(notes))

@@ -22,6 +22,7 @@ OF_POINTS = (0.8, 1.2)  # planes in terms of the depths of sparse points
 QUANTILE = 0.01  # of those depths, at either end, that may be wrong
 GUESSED = (0.5, 10.0)  # planes in terms of how far apart cameras stand, where they look side by side or outwards
 SAME_PLACE = 0.01  # of the distance to what is looked at: closer cameras are one viewpoint
+LOOKED_AT = math.cos(math.radians(35.0))  # between a view axis and the direction of what counts as looked at
 ONE_SIDE = math.cos(math.radians(60.0))  # half of the angle under which cameras on one side are seen
 FEW = 4  # viewpoints
 MAX_VIEWS = 200  # looked at, evenly spread
@@ -128,13 +129,19 @@ def find_planes(views: Viewpoints, points: Tensor | None) -> tuple[float, float,
         ends = torch.tensor([QUANTILE, 1 - QUANTILE], dtype=torch.float64)
         nearest, farthest = torch.quantile(depths[depths > 0], ends).tolist()
         return DEPTHS[0] * nearest, DEPTHS[1] * farthest, "from what the cameras look at"
-    if views.spread > SAME_PLACE * float(views.positions.norm(dim=-1).max()):
+    origin = _depth_of_origin(views)
+    if views.spread > SAME_PLACE * (origin or 0.0):
         near, far = (factor * views.spread for factor in GUESSED)
         return near, far, "guessed from how far apart the cameras stand: set data.near and data.far"
-    # One viewpoint fits a scene of any size: that of the data set's own origin, if it is looked at.
-    depth = float(depths_of(views, torch.zeros(3, dtype=torch.float64)).median())
-    depth = depth if depth > 0 else 1.0
+    # One viewpoint fits a scene of any size.
+    depth = origin or 1.0
     return DEPTHS[0] * depth, DEPTHS[1] * depth, "arbitrary: one viewpoint does not tell how far anything is"
+
+
+def _depth_of_origin(views: Viewpoints) -> float | None:
+    """The depth of the data set's own origin, if that is about what the cameras look at."""
+    depth = float(depths_of(views, torch.zeros(3, dtype=torch.float64)).median())
+    return depth if depth > 0 and depth >= LOOKED_AT * float(views.positions.norm(dim=-1).median()) else None
 
 
 def _planes_of_points(views: Viewpoints, points: Tensor) -> tuple[float, float] | None:
@@ -155,10 +162,11 @@ def unknown_parts(views: Viewpoints, focus: Tensor | None) -> str | None:
     count = len(views.positions)
     if count == 1:
         return "there is one training image: nothing says how far anything in it is, or what other sides look like"
-    distance = views.spread if focus is None else float(depths_of(views, focus).abs().median())
-    # One camera that stands still has neither spread nor focus.
-    own = max(distance, float(views.positions.norm(dim=-1).max()) if focus is None else 0.0)
-    places = _distinct(views.positions, SAME_PLACE * own)
+    # One camera that stands still has neither focus nor spread.
+    distance = max(views.spread, _depth_of_origin(views) or 0.0)
+    if focus is not None:
+        distance = float(depths_of(views, focus).abs().median())
+    places = _distinct(views.positions, SAME_PLACE * distance)
     if len(places) == 1:
         return (
             "all training images are of one camera that stands still: depth and what it does not see cannot be "

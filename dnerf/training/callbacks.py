@@ -3,16 +3,20 @@
 import logging
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from dnerf.data.bounds import cut_faces
+from dnerf.data.scene_record import SCENE, SceneRecord
 from dnerf.samplers import OccupancyAware
 
 if TYPE_CHECKING:
     from dnerf.training.run import Run
 
 logger = logging.getLogger(__name__)
+
+WIDER = 1.3  # times the box, that a warning names
 
 BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
 
@@ -94,5 +98,16 @@ class BoxWarning(Callback):
             return
         faces = cut_faces(sampler.occupied_cells(None), run.frames)
         if faces:
-            reached = ", ".join(faces)
-            logger.warning("geometry reaches the box at %s: what lies beyond is never sampled, see data.box", reached)
+            reached, wider = ", ".join(faces), _wider_box(run)
+            logger.warning("geometry reaches the box at %s: what lies beyond is never sampled; %s", reached, wider)
+
+
+def _wider_box(run: "Run") -> str:
+    """The setting that gives a box with more room, in the data set's own units, as far as the run knows them."""
+    if run.folder is None or not (run.folder / SCENE).exists():
+        return "see data.box"
+    world = SceneRecord.read(run.folder).world
+    low, high = torch.tensor(world.box)
+    middle, half = 0.5 * (low + high), 0.5 * WIDER * (high - low)
+    corners = world.similarity.box_from_world(torch.stack([middle - half, middle + half])).tolist()
+    return f"set data.box=[{','.join('[' + ','.join(f'{x:.4g}' for x in corner) + ']' for corner in corners)}]"

@@ -46,6 +46,14 @@ def test_training_ends_where_it_is_told_to(make):
     assert len(make(train_end=0.0).frames("train")) == 1
 
 
+def test_frames_after_the_end_of_training_are_not_looked_at_to_place_the_scene(folder, tmp_path):
+    root = Path(shutil.copytree(folder, tmp_path / "scene"))
+    expected = FolderData(root, train_end=0.5).world()
+    for index in range(6, 11):
+        Image.new("RGBA", (8, 8), (255, 255, 255, 255)).save(root / "train" / f"r_{index:03d}.png")
+    assert FolderData(root, train_end=0.5).world() == expected
+
+
 @pytest.mark.parametrize("train_end", [-0.1, 1.1])
 def test_a_time_outside_the_film_is_refused(make, train_end):
     with pytest.raises(ValueError, match=r"train_end must be in \[0, 1\] or None"):

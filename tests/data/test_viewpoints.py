@@ -112,3 +112,13 @@ def test_what_cannot_be_determined_is_said_in_any_units(poses, said, scale) -> N
     told = unknown_parts(own, common_focus(own))
     assert (told is None) == (said is None)
     assert said is None or said in told
+
+
+def test_cameras_side_by_side_far_from_the_origin_are_no_single_camera() -> None:
+    rows = torch.stack([look_at((float(x), -4.0, 0.0), (float(x), 0.0, 0.0)) for x in range(9)]).double()
+    away = moved(rows, torch.eye(3).double(), 1.0, (4e5, 5e6, 100.0))
+    own = views(away)
+    assert unknown_parts(own, common_focus(own)) is None
+    near, far, by = find_planes(own, None)
+    assert (near, far) == pytest.approx((2.0, 40.0))
+    assert "guessed" in by

@@ -85,7 +85,8 @@ def test_a_signal_saves_and_the_run_continues_bit_for_bit(
 
 def test_the_box_is_fitted_once_saved_and_agrees_with_auto(tmp_path: Path, whole: Path) -> None:
     config = yaml.safe_load((whole / "config.yaml").read_text())
-    box = config["data"]["box"]
+    box = config["box"]
+    assert config["data"]["box"] == "auto"
     assert all(low < high for low, high in zip(*box))
     places = [config["sampler"]["grid"], config["field"], config["renderer"]["sampler"]["grid"]]
     assert all(place["box"] == box for place in [*places, config["renderer"]["field"]["deformation"]])
@@ -94,7 +95,7 @@ def test_the_box_is_fitted_once_saved_and_agrees_with_auto(tmp_path: Path, whole
         more = run_script("train", "out_dir=run", "resume=true", *named, f"trainer.num_steps={number}", cwd=tmp_path)
         assert more.returncode == 0, more.stderr
         assert more.stdout.count("box: ") == 1
-        assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["data"]["box"] == box
+        assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["box"] == box
     assert [line["step"] for line in log_lines(tmp_path / "run")] == list(range(1, STEPS + 4))
     other = train(tmp_path, "data.box=[[-2,-2,-2],[2,2,2]]", "resume=true")
     assert other.returncode == 2

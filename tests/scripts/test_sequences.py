@@ -14,13 +14,14 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from launcher import ROOT, Run, run_script
 from omegaconf.errors import OmegaConfBaseException
 from test_scripts import TINY
 
-from dnerf.data import load_blender
+from dnerf.data import FolderData, SceneRecord
 from dnerf.evaluation import psnr
 from dnerf.evaluation.protocols import PROTOCOLS, Protocol
 
@@ -120,7 +121,9 @@ def test_key_frames_make_a_film_at_their_own_pace(work):
 
 
 def test_a_camera_that_key_frames_misplace_is_named_with_its_file(work):
-    (work / "inside.json").write_text(json.dumps({"keyframes": [{"seconds": 0, "eye": [0, 0, 0]}]}))
+    (work / "inside.json").write_text(
+        json.dumps({"keyframes": [{"seconds": 0, "eye": [0, 0, 0], "target": [0, 0, 0]}]})
+    )
     with pytest.raises(ValueError, match=r"inside.json: keyframes at 0 seconds: eye must differ from target"):
         call("render", "run=run", "path=keyframes", "path.file=inside.json")
 
@@ -147,31 +150,73 @@ def test_outputs_and_slow_motion(work):
 
 
 @pytest.mark.parametrize("path", ["orbit", "spiral", "fixed", "keyframes", "test"])
-def test_every_path_takes_its_camera_from_the_split_that_there_is(work, path, capsys):
+def test_every_path_is_filmed_from_the_run_s_own_record(work, path, monkeypatch):
+    """The data set is gone: cameras, times and box are in the run."""
     (work / "keys.json").write_text(json.dumps(KEYS))
-    shutil.copytree(work / "data", work / "bare")
-    for split in ("test", "val"):
-        (work / "bare" / "lego" / f"transforms_{split}.json").unlink()
+    (work / "data").rename(work / "away")
     file = ("path.file=keys.json",) if path == "keyframes" else ()
-    arguments = ("run=run", f"path={path}", "data_root=bare/lego", "num_frames=1", "fps=2", "format=npz", *file)
+    arguments = ("run=run", f"path={path}", "num_frames=2", "fps=2", "format=npz", *file)
     try:
-        call("render", *arguments, "path.split=train", "output=bare/named")
-        call("render", *arguments, "path.split=null", "output=bare/film")
-        assert "the camera is that of the train split: " in capsys.readouterr().out
-        films = [np.load(work / "bare" / f"{name}.npz") for name in ("named", "film")]
-        np.testing.assert_array_equal(films[0]["poses"], films[1]["poses"])
-        with pytest.raises(ValueError, match="transforms_test"):
-            call("render", *arguments, "path.split=test", "output=bare/none")
+        for split in ("train", "val"):
+            call("render", *arguments, f"path.split={split}", f"output=gone/{split}")
+            with np.load(work / "gone" / f"{split}.npz") as arrays:
+                assert np.isfinite(arrays["poses"]).all()
+        with pytest.raises(ValueError, match="data/lego"):
+            call("render", "run=run", "path=test", "outputs=[compare]", "output=gone/none")
+        with pytest.raises(ValueError, match="data/lego"):
+            call("evaluate", "run=run")
     finally:
-        shutil.rmtree(work / "bare")
+        (work / "away").rename(work / "data")
+        shutil.rmtree(work / "gone")
 
 
-def test_an_empty_film_is_noticed(work, capsys):
+def test_a_film_s_lengths_and_times_are_those_of_the_data_set(work):
+    placed = ("path=orbit", "path.radius=5", "path.target=[0.5,0,0]", "path.elevation=0", "path.turns=1")
+    call("render", "run=run", *placed, "num_frames=3", "format=npz", "outputs=[depth]", "output=own/film")
+    with np.load(work / "own" / "film.npz") as arrays:
+        eyes = arrays["poses"][:, :3, 3]
+        np.testing.assert_allclose(np.linalg.norm(eyes - [0.5, 0, 0], axis=-1), 5, rtol=1e-5)
+        np.testing.assert_allclose(eyes[:, 2], 0, atol=1e-5)
+        np.testing.assert_array_equal(arrays["data_times"], arrays["times"])
+        shown = arrays["depth"][arrays["opacity"] > 0.5]
+        assert ((shown > 2) & (shown < 8)).all()
+
+
+def test_times_beyond_training_are_shown_when_told_with_a_warning(work, capsys):
+    config = yaml.safe_load((work / "run" / "config.yaml").read_text())
+    shutil.copytree(work / "run", work / "short")
+    scene = json.loads((work / "short" / "scene.json").read_text())
+    scene["cameras"]["train"]["times"] = [0.25, 0.5, 0.75]
+    scene["world"]["clock"] = {"start": 100.0, "length": 8.0}
+    (work / "short" / "scene.json").write_text(json.dumps(scene))
+    common = ("run=short", "path=fixed", "num_frames=3", "format=npz", "output=short/film")
+    call("render", *common)
+    with np.load(work / "short" / "film.npz") as arrays:
+        assert arrays["times"].tolist() == [0.25, 0.5, 0.75]
+        assert arrays["data_times"].tolist() == [102.0, 104.0, 106.0]
+    assert "warning" not in capsys.readouterr().err
+    call("render", *common, "time_range=[100,108]", "clock=data")
+    with np.load(work / "short" / "film.npz") as arrays:
+        assert arrays["times"].tolist() == [0.0, 0.5, 1.0]
+    assert "beyond them nothing was learnt" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"time must be .* in \[100, 108\] by clock=data, got 99"):
+        call("render", *common, "time=99", "clock=data")
+    assert config["data"]["box"] == "auto"
+
+
+def test_an_empty_film_and_empty_frames_are_noticed(work, capsys):
     call("render", "run=run", "path.radius=8", "num_frames=1", "format=png", "output=far/film")
     assert "warning" not in capsys.readouterr().err
     call("render", "run=run", "path.target=[0,0,99]", "num_frames=1", "format=png", "output=far/empty")
     assert "warning: the film is empty" in (said := capsys.readouterr().err)
-    assert "path.radius=4.0, path.target=[0, 0, 99]" in said
+    assert "path.target=[0, 0, 99]" in said
+    keys = [
+        {"seconds": 0, "eye": [4, 0, 1], "target": [0, 0, 0]},
+        {"seconds": 0.5, "eye": [4, 0, 1], "target": [9, 0, 1]},
+    ]
+    (work / "away.json").write_text(json.dumps({"interpolation": "linear", "keyframes": keys}))
+    call("render", "run=run", "path=keyframes", "path.file=away.json", "fps=4", "format=png", "output=far/some")
+    assert "frames show nothing" in capsys.readouterr().err
 
 
 def test_consistency_is_checked_and_written(work, capsys, monkeypatch):
@@ -246,7 +291,9 @@ def test_a_protocol_sets_resolution_background_and_split(work, monkeypatch):
     assert (metrics["protocol"], metrics["resolution"], metrics["background"]) == ("tiny", 16, "black")
     hydra_app = importlib.import_module("hydra_app")
     renderer = hydra_app.load_renderer("run", hydra_app.load_config("run"), torch.device("cpu"))
-    frames = load_blender("data/lego", "test", 16)
+    data = FolderData("data/lego", 16)
+    data.settle(SceneRecord.read("run").world)
+    frames = data.frames("test")
     for index, scored in enumerate(metrics["frames"]):
         image = renderer.render_image(frames.camera(index), float(frames.times[index]))
         # The model's own background is white: black is what opacity leaves of it.
@@ -286,7 +333,8 @@ WRONG = [
     ("render", ("run=run", "outputs=[compare]"), "compare"),
     ("render", ("run=run", "format=[mp4,avi]"), "format"),
     ("render", ("run=run", "time=backwards"), "time"),
-    ("render", ("run=run", "time_range=[0.5,2]"), "end"),
+    ("render", ("run=run", "time_range=[0.5,2]"), "time_range must be a number in"),
+    ("render", ("run=run", "clock=wall"), "clock must be one of run, data, got 'wall'"),
     ("render", ("run=run", "time=slow", "slow_motion.factor=0"), "factor"),
     ("render", ("run=run", "resolution=[20]"), "resolution"),
     ("render", ("run=run", "path=keyframes"), "file"),
@@ -346,12 +394,18 @@ def test_a_scene_that_has_moved_is_found_where_it_is_now(work):
     shutil.rmtree(work / "elder")
 
 
-def test_a_split_that_cannot_be_scored_is_found_before_training(work):
+def test_a_split_without_images_is_said_and_not_scored(work, capsys):
     shutil.copytree(work / "data" / "lego", work / "data" / "half")
-    (work / "data" / "half" / "transforms_test.json").unlink()
-    with pytest.raises(ValueError, match="transforms_test"):
-        call("train", "experiment=fast", "data=blender", "data.root=data/half", "out_dir=never", "data.resolution=24")
-    assert not (work / "never").exists()
+    for name in ("transforms_test.json", "transforms_val.json"):
+        (work / "data" / "half" / name).unlink()
+    done = run_script(
+        "train", "experiment=fast", "data=auto", "data.root=data/half", "data.hold_out=null", "out_dir=half",
+        *TINY[4:], cwd=work,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "nothing will be scored" in done.stdout
+    assert not (work / "half" / "metrics.json").exists()
+    shutil.rmtree(work / "half")
 
 
 def test_an_image_that_no_memory_holds_is_an_error_in_one_line(work):

@@ -137,8 +137,12 @@ def test_a_loaded_run_is_the_model_its_config_and_its_data(folder: Path) -> None
     image = run.renderer.render_image(camera, 0.5)
     assert image.rgb.shape == (4, 6, 3)
     assert torch.equal(image.rgb, load_run(str(folder)).renderer.render_image(camera, 0.5).rgb)
+    with pytest.raises(ValueError, match=r"scene\.json: file does not exist"):
+        run.data()
+    build(CONFIG["data"]).record().write(folder)
     data = run.data()
     assert isinstance(data, SyntheticData)
+    assert data.world() == run.scene().world
     assert len(data.frames("train")) == 2
 
 

@@ -18,7 +18,9 @@ from dnerf.core.backgrounds import ConstantBackground, RandomBackground
 from dnerf.core.compositing import Rendering
 from dnerf.core.schedules import Ramp
 from dnerf.data import Frames, SyntheticData
+from dnerf.data.normalization import Similarity
 from dnerf.data.pixel_samplers import ErrorGuidedPixels, TemporalCurriculum, UniformPixels
+from dnerf.data.scene_record import CameraSet, SceneRecord, World
 from dnerf.deformations import DisplacementDeformation
 from dnerf.fields import DeformedField, GridField, NeRFField
 from dnerf.losses import Batch, ElasticLoss, Loss, PhotometricLoss, TimeEmbeddingLoss, UnseenSpaceLoss
@@ -300,10 +302,16 @@ def test_other_numbers_and_parts_of_another_kind_are_refused(settings: dict[str,
         trainer(**settings)
 
 
-def test_a_bar_shows_progress_and_a_warning_says_where_the_box_is_left(frames: Frames, capsys, caplog) -> None:
+def test_a_bar_shows_progress_and_a_warning_says_where_the_box_is_left(
+    frames: Frames, tmp_path: Path, capsys, caplog
+) -> None:
     inside = ((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2))  # of what is modelled
     renderer = small_renderer(sampler=OccupancySampler(OccupancyGrid(inside, 8), 0.05))
     callbacks = {"bar": ProgressBar(), "box": BoxWarning(least_steps=20)}
-    trainer(callbacks=callbacks).fit(renderer, frames)
+    world = World(inside, Similarity(0.5, center=(1.0, 0.0, 0.0)))
+    cameras = CameraSet(frames.poses, frames.times, frames.intrinsics)
+    SceneRecord(world, {"train": cameras}).write(tmp_path)
+    trainer(callbacks=callbacks).fit(renderer, frames, folder=tmp_path)
     assert "step 20, loss " in capsys.readouterr().err
     assert "geometry reaches the box at" in caplog.text
+    assert "set data.box=[[0.48,-0.52,-0.52],[1.52,0.52,0.52]]" in caplog.text  # with room, in the data's own units
