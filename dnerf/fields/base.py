@@ -1,7 +1,9 @@
 """What a radiance field is: density and colour at positions and times."""
 
+import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +12,8 @@ from dnerf.core.compositing import FieldOutput
 from dnerf.core.rays import Rays
 from dnerf.core.shortcuts import speaks_for
 from dnerf.kernels import FrameTables, GridLevels, MarchGrid
+
+logger = logging.getLogger(__name__)
 
 MOST_AT_ONCE = 1 << 17  # places that `evaluate_along_rays` evaluates in one go: bounds the memory
 PAD_TO = 2048  # places: matrix libraries compile code for every new number of rows
@@ -56,7 +60,7 @@ class NetworkTables:
     levels: GridLevels  # resolutions and table layout
     weights: list[Tensor]  # of each layer, (out_features, in_features)
     biases: list[Tensor]  # of each layer, (out_features,)
-    shifts: Tensor  # (4,) added to the outputs: the logarithm of density, then red, green and blue before a sigmoid
+    shifts: Tensor  # (n,) added to the last outputs: the logarithm of density, then harmonics of colours
 
 
 class NetworkTabled(ABC):
@@ -64,7 +68,7 @@ class NetworkTabled(ABC):
 
     @abstractmethod
     def network_tables(self) -> NetworkTables | None:
-        """Its tables, detached; None where they are not all that it shows."""
+        """Its tables, detached; None, and a warning, where they are not all that it shows."""
 
 
 class FrameTabled(ABC):
@@ -79,6 +83,12 @@ class FrameTabled(ABC):
 def field_at_time(field: RadianceField, time: float, extent: Tensor | None = None) -> RadianceField:
     """`field.at_time`, unless a subclass has another `forward` or `density` than the class that wrote it."""
     return field.at_time(time, extent) if speaks_for(field, "at_time", "forward", "density") else field
+
+
+@cache
+def warn_of_generic_path(part: str) -> None:
+    """Say, once, which part of a model keeps its images from the fused frame kernel."""
+    logger.warning("images take the generic path, which is slower: the fused frame kernel does not serve %s", part)
 
 
 def evaluate_along_rays(

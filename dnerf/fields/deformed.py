@@ -9,8 +9,15 @@ from dnerf.core.compositing import FieldOutput
 from dnerf.core.shortcuts import speaks_for
 from dnerf.deformations import CachedAtTime, Deformation
 from dnerf.deformations.base import deformation_at_time
-from dnerf.fields.base import FrameTabled, NetworkTabled, NetworkTables, RadianceField, field_at_time
-from dnerf.kernels import FrameTables, MarchGrid, is_traced
+from dnerf.fields.base import (
+    FrameTabled,
+    NetworkTabled,
+    NetworkTables,
+    RadianceField,
+    field_at_time,
+    warn_of_generic_path,
+)
+from dnerf.kernels import FrameTables, MarchGrid, is_bfloat16_wanted, is_traced
 
 
 class DeformedField(RadianceField):
@@ -47,7 +54,7 @@ class DeformedField(RadianceField):
         if deformation is self.deformation and canonical is self.canonical:
             return self
         made = CachedField if isinstance(deformation, CachedAtTime) else DeformedField
-        field = made(deformation, canonical)
+        field = (StillField if deformation.is_identity else made)(deformation, canonical)
         field.training = self.training  # its parts, which may be shared, keep theirs
         return field
 
@@ -59,22 +66,48 @@ class CachedField(DeformedField, FrameTabled):
 
     def frame_tables(self, grid: MarchGrid, num_rays: int) -> FrameTables | None:
         """See `FrameTabled`; None too where rays will need few of all displacements around occupied cells."""
-        canonical, lattice = self.canonical, self.deformation
-        is_filled = lattice.fill_around(grid, num_rays)  # at once is quicker for the generic path, too
-        if not isinstance(canonical, NetworkTabled) or not speaks_for(canonical, "network_tables", "forward"):
+        lattice = self.deformation
+        if not lattice.fill_around(grid, num_rays):  # at once is quicker for the generic path, too
             return None
-        network = canonical.network_tables()
-        if not is_filled or network is None or not _is_served(network, grid):
-            return None
-        return FrameTables(
-            occupancy=grid.occupancy, skips=grid.skips, aabb=grid.aabb, displacements=lattice.displacements,
-            is_known=lattice.is_known, low=lattice.low, sides=lattice.sides, field_low=network.low,
-            field_scale=network.scale, table=network.table, shifts=network.shifts, levels=network.levels,
-            weights=network.weights, biases=network.biases,
+        return _frame_tables(
+            self.canonical, grid, displacements=lattice.displacements, is_known=lattice.is_known, low=lattice.low,
+            sides=lattice.sides,
         )  # fmt: skip
 
 
-def _is_served(network: NetworkTables, grid: MarchGrid) -> bool:
-    tensors = (network.table, network.low, network.shifts, grid.aabb)
-    is_single = all(tensor.dtype == torch.float32 for tensor in tensors)
-    return is_single and is_traced(network.table, network.weights[0].shape[1], network.weights)
+class StillField(DeformedField, FrameTabled):
+    """A field at one time that nothing moves: displacements are zero in one cell around the occupied ones."""
+
+    def frame_tables(self, grid: MarchGrid, num_rays: int) -> FrameTables | None:
+        """See `FrameTabled`."""
+        low, high = grid.aabb[0] - grid.step, grid.aabb[1] + grid.step  # intervals reach out of cells
+        return _frame_tables(
+            self.canonical, grid, displacements=low.new_zeros(8, 4),
+            is_known=torch.ones(2, 2, 2, dtype=torch.bool, device=low.device), low=low, sides=high - low,
+        )  # fmt: skip
+
+
+def _frame_tables(canonical: RadianceField, grid: MarchGrid, **lattice: Tensor) -> FrameTables | None:
+    """Of a field in canonical space behind a lattice of displacements."""
+    if not (grid.aabb.is_cpu and is_bfloat16_wanted(grid.aabb)):
+        return None
+    if not isinstance(canonical, NetworkTabled) or not speaks_for(canonical, "network_tables", "forward"):
+        return warn_of_generic_path(f"a canonical {type(canonical).__name__}")
+    network = canonical.network_tables()
+    if network is None or not _is_served(network):
+        return None
+    return FrameTables(
+        occupancy=grid.occupancy, skips=grid.skips, aabb=grid.aabb, field_low=network.low, field_scale=network.scale,
+        table=network.table, shifts=network.shifts, levels=network.levels, weights=network.weights,
+        biases=network.biases, **lattice,
+    )  # fmt: skip
+
+
+def _is_served(network: NetworkTables) -> bool:
+    if any(tensor.dtype != torch.float32 for tensor in (network.table, network.low, network.shifts)):
+        return False
+    is_served = is_traced(network.table, network.weights[0].shape[1], network.weights)
+    if not is_served:
+        widths = [network.weights[0].shape[1], *map(len, network.weights)]
+        warn_of_generic_path(f"layers of widths {widths} here: hidden ones in multiples of 16, on AVX512-BF16")
+    return is_served

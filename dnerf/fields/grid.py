@@ -9,14 +9,19 @@ from torch import Tensor, nn
 from dnerf.core.checks import as_box, check_positive, check_shape, check_whole
 from dnerf.core.compositing import FieldOutput
 from dnerf.core.schedules import Scheduled
+from dnerf.core.spherical_harmonics import check_degree, spherical_harmonics
 from dnerf.deformations.base import check_one_time, check_positions_times
 from dnerf.fields.activations import activate_density
-from dnerf.fields.base import NetworkTabled, NetworkTables, RadianceField, TimeDependence
+from dnerf.fields.base import NetworkTabled, NetworkTables, RadianceField, TimeDependence, warn_of_generic_path
 from dnerf.fields.space_time import SpaceTimeVolumes
-from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, shade
-from dnerf.nn.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding
+from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, series_sums, shade
+from dnerf.nn.encodings import SinusoidalEncoding
 from dnerf.nn.mlp import MLP
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
+
+# Of harmonics beside the constant, which stays one: this makes them orthonormal. All coefficients take steps of one
+# size, and a colour's dependence on direction is best found more slowly than the colour.
+VIEW_SCALE = 1 / math.sqrt(4 * math.pi)
 
 
 class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
@@ -40,7 +45,9 @@ class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
             and never changes.
         space_time: features of place and time that the head sees, too: for what moves too fast, or in too many ways,
             for a deformation to follow. None for a head that does not see any.
-        view_degree: spherical-harmonics degree of the direction that a second, colour-only head sees; None for matte.
+        view_degree: degree, 0 to 4, of spherical harmonics of the direction that colour follows before its activation,
+            beside the series in time: a ray sees one of these functions all along, so images cost hardly more than
+            matte ones. None or 0 for matte.
         density_activation: "softplus" or "exp".
         density_shift: added before the activation; negative for a thin start.
         window_end: fraction of training, in (0, 1], at which every level is in; finer levels fade in one after the
@@ -60,6 +67,7 @@ class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
         super().__init__()
         check_positive("num_features", num_features)
         check_positive("temporal_terms", temporal_terms)
+        check_degree("view_degree", view_degree or 0)
         if window_end is not None and not 0 < window_end <= 1:
             raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
         for resolution in resolutions:
@@ -77,34 +85,35 @@ class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
         self.scale = nn.Buffer(1 / sides, persistent=False)
         self.table = nn.Parameter(torch.empty(self.levels.num_rows, num_features).uniform_(-1e-2, 1e-2))
         self.encode_times = None if time_frequencies is None else SinusoidalEncoding(1, time_frequencies)
-        self.encode_directions = None if view_degree is None else SphericalHarmonicsEncoding(view_degree)
         self.space_time = space_time
         self.temporal_terms = temporal_terms
+        self.view_degree = view_degree or 0
         self.orders = nn.Buffer(torch.arange(temporal_terms), persistent=False)
         in_features = num_features * self.levels.num_levels
         if self.encode_times is not None:
             in_features += self.encode_times.out_features
         if space_time is not None:
             in_features += space_time.out_features
-        if self.encode_directions is None:
-            self.head = MLP(in_features, hidden_features, num_layers, out_features=4 * temporal_terms)
-            _begin_constant(self.head, 4, temporal_terms)
-        else:
-            self.head = MLP(in_features, hidden_features, num_layers, out_features=temporal_terms + hidden_features)
-            _begin_constant(self.head, 1, temporal_terms)
-            in_colors = hidden_features + self.encode_directions.out_features
-            self.to_rgb = MLP(in_colors, hidden_features, 1, out_features=3 * temporal_terms)
-            _begin_constant(self.to_rgb, 3, temporal_terms)
-
-    @property
-    def _is_series(self) -> bool:
-        """Whether the head's outputs are all there is: it sees neither times, nor directions."""
-        return self.encode_times is None and self.encode_directions is None
+        color_terms = temporal_terms + (self.view_degree + 1) ** 2 - 1
+        self.head = MLP(in_features, hidden_features, num_layers, out_features=temporal_terms + 3 * color_terms)
+        self._begin_constant()
 
     @property
     def is_static(self) -> bool:
         """Whether neither the head nor its series sees times."""
         return self.encode_times is None and self.space_time is None and self.temporal_terms == 1
+
+    @torch.no_grad()
+    def _begin_constant(self) -> None:
+        """Let a fresh head's series begin without the terms that change."""
+        for part in self._last:
+            density, colors = self._series(part)
+            density[1:], colors[:, 1:] = 0, 0
+
+    def _series(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Of density (D, ...) and of colours (3, K, ...): parts of what the head has for each output."""
+        density, colors = outputs.tensor_split([self.temporal_terms])
+        return density, colors.unflatten(0, (3, -1))
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The networks in "head"; features, which wait long for their turn, are left in "default"."""
@@ -148,16 +157,31 @@ class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
         seen = self.head.before_output(*self._inputs(positions, times))
         return nn.functional.linear(seen, weight, bias)
 
-    def _grid_layers(self) -> tuple[list[Tensor], list[Tensor]] | None:
-        """Weights and biases of the head's hidden layers, if they see the table's features and nothing else."""
-        if self.encode_times is not None or self.space_time is not None:
+    def _grid_layers(self, time: Tensor | None = None) -> tuple[list[Tensor], list[Tensor]] | None:
+        """Weights and biases of the head's hidden layers, if they see the table's features and nothing else; at one
+        time () what they see of it is part of the first biases."""
+        if self.space_time is not None or (self.encode_times is not None and time is None):
             return None
-        return self.head.relu_parameters(self._feature_scale)
+        if self.encode_times is None or time is None:
+            return self.head.relu_parameters(self._feature_scale)
+        encoded, scale = self.encode_times(time[None]), self._feature_scale
+        scale = None if scale is None else nn.functional.pad(scale, (0, len(encoded)), value=1)
+        layers = self.head.relu_parameters(scale)
+        if layers is None:
+            return None
+        (first, *weights), (bias, *biases) = layers
+        of_table, of_time = first.tensor_split([first.shape[1] - len(encoded)], dim=1)
+        return [of_table, *weights], [bias + of_time @ encoded, *biases]
 
     def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
         """The head's outputs."""
+        return self._linear(positions, times, *self._last)
+
+    @property
+    def _last(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias of the head's last layer."""
         assert self.head.output is not None
-        return self._linear(positions, times, self.head.output.weight, self.head.output.bias)
+        return self.head.output.weight, self.head.output.bias
 
     def _activated(self, raw: Tensor) -> Tensor:
         return activate_density(raw, self.density_activation, self.density_shift)
@@ -178,9 +202,27 @@ class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
         """The series' cosines (..., K) at times (...,)."""
         return torch.cos(math.pi * self.orders.to(times.dtype) * times[..., None])
 
+    def _values(self, raw: Tensor, directions: Tensor, times: Tensor) -> Tensor:
+        """Density and colour (..., 4), before their activations, of the head's outputs."""
+        if not self.view_degree:
+            return self._at(raw, times)
+        with torch.autocast(raw.device.type, enabled=False):
+            harmonics = spherical_harmonics(directions, self.view_degree)[..., 1:] * VIEW_SCALE
+            basis = torch.cat([self._waves(times), harmonics], dim=-1)
+            sums = series_sums(raw.reshape(-1, raw.shape[-1]), basis.reshape(-1, basis.shape[-1]))
+        return sums.reshape(*times.shape, 4)
+
+    def _at_one_time(self, outputs: Tensor, waves: Tensor) -> Tensor:
+        """Rows of density, and of harmonics of colours in turn, of rows for all of the head's outputs."""
+        density, colors = self._series(outputs)
+        terms = torch.cat([density[None], colors[:, : len(waves)]])
+        summed = torch.einsum("ckh,k->ch", terms, waves)
+        harmonics = torch.cat([summed[1:, None], colors[:, len(waves) :] * VIEW_SCALE], dim=1)
+        return torch.cat([summed[:1], harmonics.flatten(0, 1)])
+
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
-        """The same with its series summed up, if it sees no directions."""
-        return GridFieldAtTime(self, time) if self._is_series else self
+        """The same with what depends on time alone summed up."""
+        return GridFieldAtTime(self, time)
 
     def _activated_values(self, values: Tensor) -> FieldOutput:
         values = values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
@@ -190,69 +232,91 @@ class GridField(RadianceField, TimeDependence, DeclaresGroups, Scheduled):
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
-        return self._activated(self._at(self._raw(positions, times)[..., : self.temporal_terms], times)[..., 0])
+        if not self.view_degree:
+            raw = self._raw(positions, times)[..., : self.temporal_terms]
+        else:  # colours have many terms
+            raw = self._linear(positions, times, *(self._series(part)[0] for part in self._last))
+        return self._activated(self._at(raw, times)[..., 0])
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3), directions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
-        raw = self._raw(positions, times)
-        if self.encode_directions is None:
-            return self._activated_values(self._at(raw, times))
-        check_shape("directions", directions, positions.shape)
-        features = torch.relu(raw[..., self.temporal_terms :])
-        colors = self.to_rgb(torch.cat([features, self.encode_directions(directions)], dim=-1))
-        return self._activated_values(self._at(torch.cat([raw[..., : self.temporal_terms], colors], dim=-1), times))
+        if self.view_degree:
+            check_shape("directions", directions, positions.shape)
+        return self._activated_values(self._values(self._raw(positions, times), directions, times))
 
 
 class GridFieldAtTime(RadianceField, NetworkTabled):
-    """A grid field at one time, for images: its series are summed up in the head's last layer, not at every sample.
+    """A grid field at one time, for images: its series in time are summed up in the head's last layer, and its head's
+    encoding of the time is part of the first one's biases, not of every sample.
 
     Args:
-        field: what is evaluated; its head sees neither times nor directions.
+        field: what is evaluated.
         time: in [0, 1]; the only one at which it may be evaluated.
 
     Raises:
-        ValueError: for another field; when evaluated, for other times.
+        ValueError: when evaluated, for other times.
     """
 
+    @torch.no_grad()
     def __init__(self, field: GridField, time: float) -> None:
         super().__init__()
-        last = field.head.output
-        if not field._is_series or last is None:
-            raise ValueError("field must be one whose head sees neither times nor directions")
-        waves = field._waves(field.low.new_tensor(time)).to(last.weight.dtype)
         self.field = field
         self.time = time
-        with torch.autocast(waves.device.type, enabled=False):
-            weight = torch.einsum("ckh,k->ch", last.weight.detach().unflatten(0, (4, -1)), waves)
-            bias = last.bias.detach().unflatten(0, (4, -1)) @ waves
-        self.weight = nn.Buffer(weight)
-        self.bias = nn.Buffer(bias)
+        now = field.low.new_tensor(time)
+        weight, bias = (part.detach() for part in field._last)
+        with torch.autocast(now.device.type, enabled=False):
+            waves = field._waves(now).to(weight.dtype)
+            self.layers = field._grid_layers(now)
+            self.weight = nn.Buffer(field._at_one_time(weight, waves))
+            self.bias = nn.Buffer(field._at_one_time(bias[:, None], waves)[:, 0])
 
     def network_tables(self) -> NetworkTables | None:
-        """Its tables; None for another density than the exponential one, or with features of space and time."""
-        field, layers = self.field, self.field._grid_layers()
-        if layers is None or field.density_activation != "exp":
-            return None
+        """Its tables; None, and a warning, for another density than the exponential one, features of space and time,
+        or a head without hidden layers."""
+        field = self.field
+        if field.density_activation != "exp":
+            return warn_of_generic_path(f"density_activation={field.density_activation}, only exp")
+        if self.layers is None:
+            return warn_of_generic_path("num_layers=0" if field.space_time is None else "space_time volumes")
         return NetworkTables(
             low=field.low, scale=field.scale, table=field.table.detach(), levels=field.levels,
-            weights=[*layers[0], self.weight], biases=[*layers[1], torch.zeros_like(self.bias)],
-            shifts=self.bias + self.bias.new_tensor([field.density_shift, 0, 0, 0]),
+            weights=[*self.layers[0], self.weight], biases=[*self.layers[1], torch.zeros_like(self.bias)],
+            shifts=self.bias + nn.functional.pad(self.bias.new_tensor([field.density_shift]), (0, len(self.bias) - 1)),
         )  # fmt: skip
 
+    def _linear(self, positions: Tensor, times: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """What a linear layer (N, n) makes of what the head's last one sees."""
+        check_positions_times(positions, times)
+        check_one_time(times, self.time)
+        field = self.field
+        if self.layers is None:
+            return field._linear(positions, times, weight, bias).reshape(-1, len(bias))
+        weights, biases = [*self.layers[0], weight], [*self.layers[1], bias]
+        return grid_network(field._unit(positions), field.table, field.levels, weights, biases)
+
+    @torch.no_grad()
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""
-        return self(positions, positions, times).density
+        if not self.field.view_degree:
+            return self(positions, positions, times).density
+        logs = self._linear(positions, times, self.weight[:1], torch.zeros_like(self.bias[:1])) + self.bias[:1]
+        return self.field._activated(logs).reshape(times.shape)
 
     @torch.no_grad()
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
-        """Density (...,) and rgb (..., 3) at positions (..., 3), for all directions (..., 3) and times (...,)."""
-        check_positions_times(positions, times)
-        check_one_time(times, self.time)
-        if self.field.density_activation != "exp":
-            return self.field._activated_values(self.field._linear(positions, times, self.weight, self.bias))
-        products = self.field._linear(positions, times, self.weight, torch.zeros_like(self.bias)).reshape(-1, 4)
-        density, rgb = shade(products, self.bias, self.field.density_shift)
+        """Density (...,) and rgb (..., 3) at positions (..., 3), directions (..., 3) and times (...,)."""
+        is_exponential, degree = self.field.density_activation == "exp", self.field.view_degree
+        nothing = torch.zeros_like(self.bias)
+        within, after = (nothing, self.bias) if is_exponential else (self.bias, nothing)
+        values = self._linear(positions, times, self.weight, within)
+        if degree:
+            check_shape("directions", directions, positions.shape)
+            basis = spherical_harmonics(directions.reshape(-1, 3), degree)
+            values, after = series_sums(values + after, basis), after.new_zeros(4)
+        if not is_exponential:
+            return self.field._activated_values(values.reshape(*times.shape, 4))
+        density, rgb = shade(values, after, self.field.density_shift)
         return FieldOutput(density.reshape(times.shape), rgb.reshape(positions.shape))
 
 
@@ -260,11 +324,3 @@ def _joined(features: Tensor, scale: Tensor | None, more: Tensor) -> tuple[Tenso
     """More columns (..., m), of scale 1, behind others."""
     scale = None if scale is None else nn.functional.pad(scale, (0, more.shape[-1]), value=1)
     return torch.cat([features, more], dim=-1), scale
-
-
-@torch.no_grad()
-def _begin_constant(network: MLP, num_series: int, num_terms: int) -> None:
-    """Let the series that a fresh network's first outputs are begin without the terms that change."""
-    assert network.output is not None
-    for part in (network.output.weight, network.output.bias):
-        part[: num_series * num_terms].unflatten(0, (num_series, num_terms))[:, 1:] = 0

@@ -1,4 +1,4 @@
-"""Fixed encodings of positions, times and directions."""
+"""Fixed encodings of positions and times."""
 
 import math
 from abc import ABC, abstractmethod
@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import check_choice, check_positive, check_whole
+from dnerf.core.checks import check_positive, check_whole
 from dnerf.core.geometry import check_last_axis
 from dnerf.core.schedules import Scheduled
 
@@ -155,48 +155,3 @@ class TimeEncoding(nn.Module, FrameTimesAware):
         before, after = (embeddings.index_select(0, (lower + i).flatten()) for i in (0, 1))
         shape = (*times.shape[:-1], embeddings.shape[1])
         return torch.lerp(before.view(shape).to(times.dtype), after.view(shape).to(times.dtype), places - lower)
-
-
-class SphericalHarmonicsEncoding(nn.Module):
-    """Real spherical harmonics of a unit direction up to a degree: (degree + 1)^2 numbers.
-
-    Source: Sloan, "Efficient Spherical Harmonic Evaluation" (JCGT 2013); orthonormal on the sphere, with the
-    signs of the usual graphics convention (Condon-Shortley phase included).
-
-    Args:
-        degree: 0 to 3.
-
-    Raises:
-        ValueError: for another degree.
-    """
-
-    def __init__(self, degree: int = 3) -> None:
-        super().__init__()
-        check_choice("degree", degree, (0, 1, 2, 3))
-        self.degree = degree
-        self.out_features = (degree + 1) ** 2
-
-    def forward(self, directions: Tensor) -> Tensor:
-        """Encode unit directions (..., 3) -> (..., (degree + 1)^2)."""
-        check_last_axis("directions", directions, 3)
-        x, y, z = directions.unbind(-1)
-        terms = [torch.full_like(x, 0.5 * math.sqrt(1 / math.pi))]
-        if self.degree >= 1:
-            c = math.sqrt(3 / (4 * math.pi))
-            terms += [-c * y, c * z, -c * x]
-        if self.degree >= 2:
-            c = math.sqrt(15 / math.pi)
-            xx, yy, zz = x * x, y * y, z * z
-            terms += [
-                c / 2 * x * y, -c / 2 * y * z, math.sqrt(5 / math.pi) / 4 * (2 * zz - xx - yy), -c / 2 * x * z,
-                c / 4 * (xx - yy),
-            ]  # fmt: skip
-        if self.degree >= 3:
-            a, b = math.sqrt(35 / (2 * math.pi)) / 4, math.sqrt(21 / (2 * math.pi)) / 4
-            c, d = math.sqrt(105 / math.pi) / 4, math.sqrt(7 / math.pi) / 4
-            terms += [
-                -a * y * (3 * xx - yy), 2 * c * x * y * z, -b * y * (4 * zz - xx - yy),
-                d * z * (2 * zz - 3 * xx - 3 * yy), -b * x * (4 * zz - xx - yy), c * z * (xx - yy),
-                -a * x * (xx - 3 * yy),
-            ]  # fmt: skip
-        return torch.stack(terms, dim=-1)

@@ -53,6 +53,7 @@ FIELDS = {
     "grid, changing and view-dependent": Case(lambda: small_grid(view_degree=2, temporal_terms=3), True),
     "grid, space-time": Case(small_space_time),
     "grid, space-time and view-dependent": Case(lambda: small_space_time(2), True),
+    "grid, timed": Case(lambda: small_grid(time_frequencies=3)),
     "grid, timed and view-dependent": Case(lambda: small_grid(time_frequencies=3, view_degree=2), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),
@@ -106,7 +107,9 @@ def test_density_is_not_negative_and_colours_are_colours(name: str, scale: float
 def test_density_alone_equals_that_of_the_whole_output(name: str) -> None:
     field = trained(name)
     positions, directions, times = some_points(100)
-    assert torch.equal(field.density(positions, times), field(positions, directions, times).density)
+    # Matrix products of other sizes round differently: a field may know density by less than it has to colour.
+    alone, whole = field.density(positions, times), field(positions, directions, times).density
+    torch.testing.assert_close(alone, whole, rtol=1e-6 if name in VIEW_DEPENDENT else 0, atol=0)
 
 
 @every_field
@@ -206,8 +209,8 @@ def test_bfloat16_autocast_is_close_to_float32(name: str) -> None:
     # A digit of bfloat16 is 2^-8; some layers of it, on outputs of size one.
     torch.testing.assert_close(output.density, exact.density, rtol=0.05, atol=0.02)
     torch.testing.assert_close(output.rgb, exact.rgb, rtol=0, atol=0.03)
-    # Equal to that of the whole output also here.
-    torch.testing.assert_close(output.density, density, rtol=0, atol=0)
+    # Equal to that of the whole output also here, but where matrix products of other sizes round differently.
+    torch.testing.assert_close(output.density, density, rtol=0.01 if name in VIEW_DEPENDENT else 0, atol=0)
 
 
 @every_field

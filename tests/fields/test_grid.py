@@ -5,7 +5,9 @@ from itertools import pairwise
 import pytest
 import torch
 
+from dnerf.core.spherical_harmonics import spherical_harmonics
 from dnerf.fields import GridField, SpaceTimeVolumes
+from dnerf.fields.base import warn_of_generic_path
 from dnerf.fields.grid import GridFieldAtTime
 from dnerf.kernels import grid_network, shade
 
@@ -48,7 +50,9 @@ def test_parts_that_are_not_asked_for_do_not_exist() -> None:
 
     assert keys() == {"head"}
     assert keys(time_frequencies=2) == {"head", "encode_times"}
-    assert keys(view_degree=1) == {"head", "encode_directions", "to_rgb"}
+    assert keys(view_degree=1) == {"head"}
+    assert small(view_degree=1).head.out_features == 1 + 3 * 4
+    assert small(view_degree=2, temporal_terms=4).head.out_features == 4 + 3 * (4 + 8)
 
 
 def test_time_features_let_a_place_change_with_time() -> None:
@@ -78,10 +82,49 @@ def test_density_and_colour_follow_cosine_series_that_begin_constant(view_degree
     assert (found[:, 1:].abs().amax((0, 1)) > 1e-3).all()
 
 
+def directions(count: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(5)
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64)).to(dtype)
+
+
+def test_degree_zero_is_matte() -> None:
+    torch.manual_seed(0)
+    glossy = small(temporal_terms=3, view_degree=0)
+    torch.manual_seed(0)
+    matte = small(temporal_terms=3)
+    glossy.load_state_dict(matte.state_dict())
+    places, times = torch.rand(50, 3), torch.rand(50)
+    for a, b in ((glossy, matte), (glossy.at_time(0.4), matte.at_time(0.4))):
+        times = times if a is glossy else torch.full((50,), 0.4)
+        seen, expected = a(places, directions(50), times), b(places, places, times)
+        assert torch.equal(seen.rgb, expected.rgb)
+        assert torch.equal(seen.density, expected.density)
+
+
+@pytest.mark.parametrize("degree", [1, 4])
+def test_colour_follows_harmonics_of_the_direction_and_cosines_of_time_and_begins_matte(degree: int) -> None:
+    """Before its activation colour is a sum of both; density sees no direction."""
+    field, terms = small(temporal_terms=3, view_degree=degree).double(), (degree + 1) ** 2 + 2
+    places, seen_from = torch.rand(20, 1, 3, dtype=torch.float64).expand(20, 60, 3), directions(60, torch.float64)
+    seen_from, times = seen_from.expand(20, 60, 3), torch.rand(60, dtype=torch.float64).expand(20, 60)
+    fresh = field(places, seen_from, times)
+    torch.testing.assert_close(fresh.rgb, fresh.rgb[:, :1].expand_as(fresh.rgb), rtol=1e-12, atol=0)
+    for parameter in field.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    values = torch.logit(field(places, seen_from, times).rgb)
+    waves = torch.cos(torch.pi * torch.arange(3, dtype=torch.float64) * times[0, :, None])
+    basis = torch.cat([waves, spherical_harmonics(seen_from[0], degree)[:, 1:]], dim=-1)
+    found = torch.linalg.lstsq(basis[:terms].expand(20, -1, -1), values[:, :terms]).solution
+    torch.testing.assert_close(basis @ found, values, rtol=0, atol=1e-7)  # conditions of some hundreds
+    assert (found.abs().amax((0, 2)) > 1e-3).all()
+    density = field.density(places, times)
+    torch.testing.assert_close(density, field(places, -seen_from, times).density, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize(("box", "options", "message"), [
     ([[0, 0, 0], [1, 0, 1]], {}, "box must have finite corners"),
     (BOX, {"num_features": 0}, "num_features must be > 0"), (BOX, {"temporal_terms": 0}, "temporal_terms must be > 0"),
-    (BOX, {"resolutions": ()}, "resolutions"),
+    (BOX, {"resolutions": ()}, "resolutions"), (BOX, {"view_degree": 5}, "view_degree must be one of 0, 1, 2, 3, 4"),
 ])  # fmt: skip
 def test_bad_grids_are_refused(box: list, options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
@@ -133,38 +176,47 @@ def test_a_window_outside_the_training_is_refused(end: float) -> None:
         small(window_end=end)
 
 
-def test_series_are_summed_up_for_images_where_there_are_any() -> None:
-    for options in (
-        {"view_degree": 1},
-        {"temporal_terms": 3, "view_degree": 1},
-        {"temporal_terms": 3, "time_frequencies": 2},
-    ):
-        field = small(**options)
-        assert field.at_time(0.3) is field
+def test_what_depends_on_time_alone_is_summed_up_for_images() -> None:
+    glossy = small(temporal_terms=3, time_frequencies=2, view_degree=1).at_time(0.3)
+    assert isinstance(glossy, GridFieldAtTime)
+    assert glossy.weight.shape == (1 + 3 * 4, 16)
+    assert glossy.layers is not None
+    assert glossy.layers[0][0].shape == (16, 4)  # of the table's features, not of times
     frozen = small(temporal_terms=3).at_time(0.3)
     assert isinstance(frozen, GridFieldAtTime)
     assert frozen.weight.shape == (4, 16)  # of the head's sixteen to density and colour, not to 4 x 3 terms
-    with pytest.raises(ValueError, match="field must be one whose head sees neither times nor directions"):
-        GridFieldAtTime(small(view_degree=1), 0.3)
     with pytest.raises(ValueError, match=r"times must all be 0\.3, got values from 0\.5 to 0\.5"):
         frozen.density(torch.zeros(4, 3), torch.full((4,), 0.5))
 
 
-def test_tables_for_the_frame_kernel_are_all_that_the_field_shows() -> None:
-    field = small(temporal_terms=3, window_end=1.0)
+@pytest.mark.parametrize("options", [{}, {"view_degree": 2}, {"view_degree": 1, "time_frequencies": 2}])
+def test_tables_for_the_frame_kernel_are_all_that_the_field_shows(options: dict) -> None:
+    field = small(temporal_terms=3, window_end=1.0, **options)
     field.set_progress(0.6)
     torch.nn.init.normal_(field.head.output.weight)
     tables = field.at_time(0.3).network_tables()
     positions = torch.lerp(*torch.tensor(BOX), torch.rand(50, 3))
     unit = (positions - tables.low) * tables.scale
-    raw = grid_network(unit, tables.table, tables.levels, tables.weights, tables.biases)
-    density, rgb = shade(raw, tables.shifts, 0.0)
-    expected = field(positions, positions, torch.full((50,), 0.3))
+    raw = grid_network(unit, tables.table, tables.levels, tables.weights, tables.biases) + tables.shifts
+    basis = spherical_harmonics(directions(50), options.get("view_degree", 0))
+    colors = (raw[:, 1:].unflatten(1, (3, -1)) * basis[:, None]).sum(-1)
+    density, rgb = shade(torch.cat([raw[:, :1], colors], dim=1), torch.zeros(4), 0.0)
+    expected = field(positions, directions(50), torch.full((50,), 0.3))
     torch.testing.assert_close(density, expected.density, rtol=1e-4, atol=0)
     torch.testing.assert_close(rgb, expected.rgb, rtol=0, atol=1e-5)
-    volumes = SpaceTimeVolumes(BOX, (4,), (3,))
-    for options in ({"density_activation": "softplus"}, {"space_time": volumes}):
-        assert small(**options).at_time(0.3).network_tables() is None
+
+
+@pytest.mark.parametrize(("options", "part"), [
+    ({"density_activation": "softplus"}, "density_activation=softplus"), ({"num_layers": 0}, "num_layers=0"),
+    ({"space_time": SpaceTimeVolumes(BOX, (4,), (3,))}, "space_time volumes"),
+])  # fmt: skip
+def test_parts_that_the_frame_kernel_does_not_serve_are_named_once(
+    options: dict, part: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_generic_path.cache_clear()
+    for time in (0.3, 0.4):
+        assert small(**options).at_time(time).network_tables() is None
+    assert [part in record.message for record in caplog.records] == [True]
 
 
 def test_what_is_no_level_is_seen_whatever_the_window() -> None:

@@ -1,13 +1,13 @@
-"""Encodings against loops and against quadrature on the sphere."""
+"""Encodings against loops."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from reference import sinusoidal, sphere_quadrature
+from reference import sinusoidal
 
-from dnerf.nn.encodings import SinusoidalEncoding, SphericalHarmonicsEncoding, TimeEncoding
+from dnerf.nn.encodings import SinusoidalEncoding, TimeEncoding
 
 
 @pytest.mark.parametrize("num_dims", [1, 3])
@@ -180,47 +180,3 @@ def test_sinusoidal_encoding_refuses_bad_arguments(arguments: dict, message: str
 def test_values_of_another_size_are_named() -> None:
     with pytest.raises(ValueError, match=r"values must have shape \(..., 1\), got \(5, 2\)"):
         SinusoidalEncoding(1, 4)(torch.zeros(5, 2))
-    with pytest.raises(ValueError, match=r"directions must have shape \(..., 3\), got \(5, 2\)"):
-        SphericalHarmonicsEncoding()(torch.zeros(5, 2))
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_spherical_harmonics_are_orthonormal(degree: int) -> None:
-    # Products have degree 6 at most: four Gauss points in z and seven angles integrate them exactly.
-    points, weights = sphere_quadrature(4, 7)
-    values = SphericalHarmonicsEncoding(degree)(points)
-    assert values.shape[-1] == (degree + 1) ** 2
-    gram = values.T @ (weights[:, None] * values)
-    torch.testing.assert_close(gram, torch.eye((degree + 1) ** 2, dtype=torch.float64), rtol=0, atol=1e-13)
-
-
-def test_spherical_harmonics_have_the_eigenvalues_of_their_degree() -> None:
-    """On the unit sphere the Laplacian multiplies degree l by -l (l + 1); here by central differences of rotations."""
-    points, _ = sphere_quadrature(4, 7)
-    encoding, step = SphericalHarmonicsEncoding(3), 1e-3
-    laplacian = torch.zeros(len(points), 16, dtype=torch.float64)
-    for axis in range(3):
-        angle = torch.zeros(3, 3, dtype=torch.float64)
-        angle[(axis + 1) % 3, (axis + 2) % 3] = step
-        turn = torch.linalg.matrix_exp(angle - angle.T)
-        laplacian += encoding(points @ turn) + encoding(points @ turn.T) - 2 * encoding(points)
-    eigenvalues = torch.tensor([-float(l * (l + 1)) for l in range(4) for _ in range(2 * l + 1)])  # noqa: E741
-    # Second differences: an error of step^2 l^4 / 12 beside rounding of 1e-16 / step^2.
-    torch.testing.assert_close(laplacian / step**2, eigenvalues * encoding(points), rtol=0, atol=1e-4)
-
-
-def test_spherical_harmonics_have_the_graphics_signs() -> None:
-    encode = SphericalHarmonicsEncoding(3)
-    x, y, z = encode(torch.eye(3, dtype=torch.float64))
-    first = math.sqrt(3 / (4 * math.pi))
-    assert y[1].item() == pytest.approx(-first)
-    assert z[2].item() == pytest.approx(first)
-    assert x[3].item() == pytest.approx(-first)
-    assert z[6].item() == pytest.approx(math.sqrt(5 / (4 * math.pi)))
-    assert z[12].item() == pytest.approx(math.sqrt(7 / (4 * math.pi)))
-    assert x[15].item() < 0 < x[8].item()
-
-
-def test_spherical_harmonics_refuse_another_degree() -> None:
-    with pytest.raises(ValueError, match="degree must be one of 0, 1, 2, 3; got 4"):
-        SphericalHarmonicsEncoding(4)

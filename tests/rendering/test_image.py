@@ -13,9 +13,10 @@ from dnerf.core.backgrounds import ConstantBackground
 from dnerf.core.cameras import Camera, Intrinsics, look_at
 from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.rays import Rays, Samples
-from dnerf.deformations import CachedDeformation, DisplacementDeformation
+from dnerf.deformations import CachedDeformation, DisplacementDeformation, IdentityDeformation
 from dnerf.deformations.cached import CachedAtTime
 from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes
+from dnerf.fields.base import warn_of_generic_path
 from dnerf.kernels.cpu.dense import has_vectors
 from dnerf.kernels.trace_network import trace_network
 from dnerf.rendering.renderer import Renderer
@@ -28,15 +29,14 @@ vectors = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no v
 
 
 def model(
-    *, temporal_terms: int = 3, subdivision: int = 1, stop: float = 1e-4, box: list | None = None, cells: int = 24,
-    volumes: SpaceTimeVolumes | None = None, precision: str = "bfloat16", canonical: type[GridField] = GridField,
-    sampler: type[OccupancySampler] = OccupancySampler,
+    *, subdivision: int = 1, stop: float = 1e-4, box: list | None = None, cells: int = 24,
+    precision: str = "bfloat16", canonical: type[GridField] = GridField,
+    sampler: type[OccupancySampler] = OccupancySampler, **options: object,
 ) -> Renderer:  # fmt: skip
     """A random body in the middle of the box, moved a little."""
     torch.manual_seed(0)
-    grid = canonical(
-        BOX, (4, 9), 4, temporal_terms=temporal_terms, hidden_features=16, density_shift=2.0, space_time=volumes
-    )
+    settings = {"temporal_terms": 3, "hidden_features": 16, "density_shift": 2.0, **options}
+    grid = canonical(BOX, (4, 9), 4, **settings)  # type: ignore[arg-type]
     deformation = DisplacementDeformation(2, 16, (), position_frequencies=2, time_frequencies=2, canonical_time=None)
     with torch.no_grad():
         grid.table.mul_(150)
@@ -83,12 +83,15 @@ def fused(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
 
 
 @vectors
-@pytest.mark.parametrize("temporal_terms", [1, 3])
+@pytest.mark.parametrize("options", [
+    {"temporal_terms": 1}, {}, {"view_degree": 2}, {"temporal_terms": 1, "view_degree": 4},
+    {"time_frequencies": 2, "view_degree": 1},
+])  # fmt: skip
 @pytest.mark.parametrize("subdivision", [1, 3])
 def test_the_fused_kernel_shows_what_the_generic_path_shows(
-    temporal_terms: int, subdivision: int, fused: list[Tensor]
+    options: dict, subdivision: int, fused: list[Tensor]
 ) -> None:
-    renderer = model(temporal_terms=temporal_terms, subdivision=subdivision)
+    renderer = model(subdivision=subdivision, **options)
     expected = generic(renderer)
     assert not fused
     shown = image(renderer)
@@ -105,6 +108,21 @@ def test_the_fused_kernel_shows_what_the_generic_path_shows(
 
 
 @vectors
+@pytest.mark.parametrize("subdivision", [1, 3])
+def test_what_nothing_moves_is_rendered_by_the_kernel_too(subdivision: int, fused: list[Tensor]) -> None:
+    renderer = model(subdivision=subdivision)
+    still, field = IdentityDeformation(), renderer.field
+    shown = []
+    for deformation in (still, CachedDeformation(still, BOX, 24)):
+        renderer.field = DeformedField(deformation, field.canonical).eval()  # type: ignore[union-attr,arg-type]
+        shown.append(image(renderer))
+        assert torch.cat(fused).all()
+        torch.testing.assert_close(shown[-1][..., :4], generic(renderer)[..., :4], rtol=0, atol=3e-3)
+    assert len(fused) == 2
+    assert torch.equal(*shown)
+
+
+@vectors
 def test_rays_that_the_kernel_cannot_follow_are_rendered_all_the_same(fused: list[Tensor]) -> None:
     small = model(box=[[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]], cells=12)
     torch.testing.assert_close(image(small)[..., :4], generic(small)[..., :4], rtol=0, atol=3e-3)
@@ -114,9 +132,32 @@ def test_rays_that_the_kernel_cannot_follow_are_rendered_all_the_same(fused: lis
 @vectors
 def test_the_kernel_is_used_only_for_what_it_was_made_for(fused: list[Tensor]) -> None:
     volumes = SpaceTimeVolumes(BOX, (3,), (2,), num_features=2)
-    for renderer in (model(precision="float32"), model(volumes=volumes), model(stop=0.0)):
+    for renderer in (model(precision="float32"), model(space_time=volumes), model(stop=0.0)):
         image(renderer)
     assert not fused
+
+
+@vectors
+@pytest.mark.parametrize(("options", "part"), [
+    ({"space_time": SpaceTimeVolumes(BOX, (3,), (2,), num_features=2)}, "space_time volumes"),
+    ({"hidden_features": 12}, r"layers of widths [8, 12, 12, 4]"),
+])  # fmt: skip
+def test_parts_that_keep_a_model_from_the_kernel_are_named(
+    options: dict, part: str, fused: list[Tensor], caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_generic_path.cache_clear()
+    renderer = model(**options)
+    for _ in range(2):
+        image(renderer)
+    assert [part in record.message for record in caplog.records] == [True]
+    assert not fused
+
+
+@vectors
+def test_another_canonical_field_is_named(fused: list[Tensor], caplog: pytest.LogCaptureFixture) -> None:
+    warn_of_generic_path.cache_clear()
+    image(model(canonical=Grey))
+    assert ["a canonical Grey" in record.message for record in caplog.records] == [True]
 
 
 @vectors
