@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dnerf.data.frames import Frames, composite_on
 from dnerf.rendering.renderer import Renderer
+from dnerf.training.averaging import WeightAverage
 from dnerf.training.inheritance import take_over
 from dnerf.training.run import Run
 from dnerf.training.trainer import Trainer
@@ -20,6 +21,8 @@ Maker = Callable[[Mapping[str, str]], tuple[Renderer, Trainer]]
 HELD_SHARE = 0.125  # of the frames
 LEAST_FRAMES = 8  # of the training split, below which none is held out
 NUM_RAYS = 8192  # of a comparison
+SPAN = 0.05  # of all steps done, over which weights are averaged for a comparison: steps of one size are noisy
+AVERAGE = "average"  # callback
 STANDARD_ERRORS = 2.0  # by which a candidate must be better than the one that stands
 
 
@@ -43,6 +46,7 @@ class Contender:
         self.choice, self.trainer, self.run = choice, trainer, run
         self.errors = torch.empty(0)  # (F,) mean squared, of each held-out frame
         self.has_failed = False
+        self.average = WeightAverage(SPAN, every=1)
 
     @classmethod
     def fresh(cls, choice: str, make: Maker, choices: Mapping[str, str], frames: Frames, seed: int) -> "Contender":
@@ -70,10 +74,28 @@ class Contender:
         except FloatingPointError:
             self.has_failed = True
 
+    def begin(self) -> None:
+        """Average the weights from now on."""
+        self.average = WeightAverage(SPAN, every=1)
+        self.run.callbacks = {**self.run.callbacks, AVERAGE: self.average}
+        self.average.on_train_begin(self.run)
+
+    @torch.no_grad()
     def compare(self, held: "HeldOut") -> None:
-        """Note the errors on held-out frames: infinite ones of a candidate that failed."""
-        errors = held.errors(self.run.renderer)
+        """Note the errors of the averaged weights on held-out frames: infinite ones of a candidate that failed."""
+        renderer = self.run.renderer
+        weights = {name: x.detach().clone() for name, x in renderer.named_parameters()}
+        self.average.on_train_end(self.run)
+        errors = held.errors(renderer)
+        for name, parameter in renderer.named_parameters():
+            parameter.copy_(weights[name])
+        renderer.invalidate()
+        self.average.on_train_begin(self.run)
         self.errors = torch.full_like(errors, math.inf) if self.has_failed else errors
+
+    def end(self) -> None:
+        """Average no more."""
+        self.run.callbacks = {name: x for name, x in self.run.callbacks.items() if name != AVERAGE}
 
 
 @dataclass(frozen=True)
@@ -155,6 +177,8 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> R
         effort: of each until the last comparison, in as many rounds as there are halvings.
     """
     left, seconds = list(contenders), 0.0
+    for contender in contenders:
+        contender.begin()
     num_rounds = max(1, math.ceil(math.log2(len(left))))
     for _ in range(num_rounds):
         for contender in left:
@@ -168,6 +192,8 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> R
         seconds += time.perf_counter() - begin
         if len(left) > 2:
             left = sorted(left, key=lambda c: float(c.errors.mean()))[: (len(left) + 1) // 2]
+    for contender in contenders:
+        contender.end()
     standing = contenders[0]
     best = min(left, key=lambda c: float(c.errors.mean()))
     if best is not standing:
