@@ -52,9 +52,9 @@ class ControlGraphDeformation(Deformation, DeclaresGroups):
     """
 
     def __init__(
-        self, box: Sequence[Sequence[float]], num_nodes: int = 256, num_courses: int = 32, *,
+        self, box: Sequence[Sequence[float]], num_nodes: int = 512, num_courses: int = 64, *,
         hidden_features: int = 128, num_layers: int = 3, position_frequencies: int = 3, time_frequencies: int = 5,
-        time_embeddings: int = 0, embedding_features: int = 4, reach: float = 0.6,
+        time_embeddings: int = 0, embedding_features: int = 4, reach: float = 1.0,
     ) -> None:  # fmt: skip
         super().__init__()
         corners = as_box(box)
