@@ -43,6 +43,9 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     data.settle(world)
     frames = data.frames("train")
     config, background = suited(config, world, frames)
+    # The same seed in every process: they begin with one model.
+    torch.manual_seed(config.seed)
+    renderer, trainer = (build(config[name], trusted=True) for name in ("renderer", "trainer"))
     folder = processes.from_first(lambda: held.enter_context(opened(config)))
     plan, begun = None, None
     if parts := planning.parts_of(config):
@@ -51,10 +54,9 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
         else:  # the first one decides, and training begins anew
             plan = processes.from_first(lambda: planning.decide(config, parts, frames, device, folder)[0])
         config = planning.as_planned(config, parts, plan.choices, folder)
-    # The same seed in every process: they begin with one model.
-    torch.manual_seed(config.seed)
-    renderer = build(config.renderer, trusted=True).to(device) if begun is None else begun.renderer
-    trainer = build(config.trainer, trusted=True)
+        torch.manual_seed(config.seed)
+        renderer, trainer = (build(config[name], trusted=True) for name in ("renderer", "trainer"))
+    renderer = renderer.to(device) if begun is None else begun.renderer
     said = background_contradiction(renderer.background.constant(), frames)
     if processes.is_first:
         if not (resume and (folder / SCENE).exists()):

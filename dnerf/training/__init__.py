@@ -4,6 +4,7 @@ from dnerf.training.averaging import WeightAverage
 from dnerf.training.callbacks import BoxWarning, Callback, ProgressBar
 from dnerf.training.checkpoint_folder import CheckpointFolder, Checkpoints
 from dnerf.training.logging import JsonLinesLog, Previews, TensorBoardLog
+from dnerf.training.nodes import PlaceNodes
 from dnerf.training.optimizer import AdamMuon, AdamSettings
 from dnerf.training.records import TrainingRecord
 from dnerf.training.recovery import Recovery
@@ -13,6 +14,6 @@ from dnerf.training.trainer import Trainer
 
 __all__ = [
     "AdamMuon", "AdamSettings", "BoxWarning", "Callback", "CheckpointFolder", "Checkpoints", "JsonLinesLog",
-    "Previews", "ProgressBar", "Recovery", "Run", "TensorBoardLog", "Trainer", "TrainingRecord",
+    "PlaceNodes", "Previews", "ProgressBar", "Recovery", "Run", "TensorBoardLog", "Trainer", "TrainingRecord",
     "TrainingStopped", "WeightAverage",
 ]  # fmt: skip
