@@ -35,6 +35,10 @@ PARTS: dict[str, tuple[str, ...]] = {
         "dnerf::packed_weights", "dnerf::packed_weights_grad", "dnerf::packed_sum", "dnerf::packed_sum_grad_values",
         "dnerf::packed_sum_grad_weights",
     ),
+    "series in time and direction": (
+        "dnerf::series_sums", "dnerf::series_sums_grad_coefficients", "dnerf::series_sums_grad_basis",
+    ),
+    "control graph": ("dnerf::blend_rigid", "dnerf::blend_rigid_grad"),
     "optimiser": ("aten::_fused_adam_",),
     "sines and cosines": ("aten::sin", "aten::cos"),
     "activations, forward and backward": (

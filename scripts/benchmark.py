@@ -67,6 +67,7 @@ def _parts(overrides: Sequence[str]) -> Mapping[str, Any]:
     config = compose("train", list(overrides))
     data = build(config.data, trusted=True)
     world = data.world()
+    data.settle(world)
     config, _ = suited(config, world, data.frames("train"))
     parts = {name: build(config[name], trusted=True) for name in ("renderer", "trainer")}
     return {"chunk": config.chunk, "data": data, **parts}

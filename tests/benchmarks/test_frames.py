@@ -1,5 +1,7 @@
 """The suite that times frames of finished models."""
 
+from types import SimpleNamespace
+
 import benchmark
 import pytest
 import torch
@@ -80,7 +82,8 @@ def test_ways_change_settings_that_a_run_has(monkeypatch):
     saved = {"renderer": {"sampler": {"render_subdivision": 3, "min_weight": None}}, "data": {}, "chunk": 7}
     monkeypatch.setattr(benchmark, "load_config", lambda run: OmegaConf.create(saved))
     monkeypatch.setattr(benchmark, "load_renderer", lambda run, config, device: config.renderer.sampler)
-    monkeypatch.setattr(benchmark, "build", lambda config: config)
+    monkeypatch.setattr(benchmark, "build", lambda config: SimpleNamespace(settle=lambda world: None))
+    monkeypatch.setattr(benchmark, "load_scene", lambda run: SimpleNamespace(world=None))
     changes = ["renderer.sampler.render_subdivision=1", "renderer.sampler.min_weight=0.5"]
     assert benchmark._finished("one", changes)["renderer"] == {"render_subdivision": 1, "min_weight": 0.5}
     assert benchmark._finished("one", [])["renderer"] == saved["renderer"]["sampler"]

@@ -12,7 +12,6 @@ from benchmarks.operations import LAYER, OperationCounter
 from benchmarks.plain_kernels import plain_grid_encode, plain_packed_weights
 from benchmarks.profile import PARTS
 from benchmarks.quadrature import samples_needed
-from benchmarks.scaling import measure
 from benchmarks.smooth import SmoothClouds, exact_smooth
 from dnerf.core.rays import Rays
 from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, packed_weights, relu_layers
@@ -22,7 +21,7 @@ RATES = Rates({torch.float32: 1e9}, bandwidth=1e9, cached_bandwidth=1e9)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["flow", "kernels", "precision", "quadrature", "scaling"])
+@pytest.mark.parametrize("name", ["flow", "kernels", "precision", "quadrature"])
 def test_suite_runs_at_its_quick_size(name):
     result = run_suite(name, Settings(quick=True))
     assert result.findings
@@ -133,13 +132,3 @@ def test_truth_of_smooth_clouds_agrees_with_many_samples():
         left = left * torch.exp(-depth.sum(-1))
     # The box ends at 1.6, beyond which the clouds are thinner than 1e-4.
     torch.testing.assert_close(truth, color + left[:, None], rtol=0, atol=1e-4)
-
-
-def test_samples_follow_what_is_occupied_and_not_the_box():
-    sizes = {"occupancy_resolution": 48, "grid_resolution": 16, "rays": 300, "extent": 3.0, "occupied": 0.5}
-    counts = {
-        name: measure({**sizes, **changes}, 1e-3, 0, "cpu")["samples"]
-        for name, changes in (("base", {}), ("rays", {"rays": 600}), ("finer", {"occupancy_resolution": 96}))
-    }
-    assert counts["rays"] == pytest.approx(2 * counts["base"], rel=0.2)
-    assert counts["finer"] < counts["base"]

@@ -14,7 +14,7 @@ from dnerf.scenes import make_scene
 def truth():
     """Frames and a renderer of the very scene they show, so that scores are known to be good."""
     source = SyntheticData(make_scene("pulsing_fog"), 16, num_test=5)
-    return source.frames("test"), Renderer(source.scene, StratifiedSampler(256, source.box))
+    return source.frames("test"), Renderer(source.scene, StratifiedSampler(256, source.world().box))
 
 
 def test_the_scene_itself_scores_nearly_perfectly_and_mode_is_restored(truth):
