@@ -3,7 +3,6 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from hydra import compose
@@ -14,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dnerf.data.frames import Frames
 from dnerf.planning import Part, Plan, make_plan
-from dnerf.planning.plan import FILE, fingerprint, load_plan
+from dnerf.planning.plan import FILE, fingerprint, load_plan, settled
 from dnerf.rendering.renderer import Renderer
 from dnerf.training.run import Run
 from dnerf.training.trainer import Trainer
@@ -35,16 +34,8 @@ def given_choices(config: DictConfig, parts: Mapping[str, Part], data: str, fold
     Raises:
         ValueError: for a part or a candidate that there is not, or a plan of another data set.
     """
-    plan: Any = config.plan
-    given = {str(name): value for name, value in plan.items() if name not in SETTINGS and value is not None}
-    if plan.file is not None:
-        saved = load_plan(Path(plan.file))
-        if saved.data and saved.data != data:
-            raise ValueError(f"plan.file: {plan.file} is about another data set; leave it out, or the line data in it")
-        given = {**saved.choices, **given}
-    for name in given.keys() - parts.keys():
-        raise ValueError(f"plan.{name} is none of the parts {', '.join(parts)}")
-    choices = {name: parts[name].named(name, value) for name, value in given.items()}
+    given = {str(name): value for name, value in config.plan.items() if name not in SETTINGS and value is not None}
+    choices = settled(parts, given, None if config.plan.file is None else Path(config.plan.file), data)
     touched = {_key(override) for override in given_overrides(folder)}
     for name, part in parts.items():
         defining = {_key(overrides[0]) for overrides in part.candidates.values() if overrides}

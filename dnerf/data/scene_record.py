@@ -93,6 +93,20 @@ class SceneRecord:
             "cameras": {name: _plain(cameras) for name, cameras in self.cameras.items()},
         })  # fmt: skip
 
+    def summary(self) -> list[str]:
+        """What there is, a line each: frames of every split, lens, times."""
+        lines = []
+        for split, cameras in self.cameras.items():
+            sizes = sorted({f"{lens.width} x {lens.height}" for lens in cameras.intrinsics})
+            shown = sizes[0] if len(sizes) == 1 else f"{len(sizes)} sizes, {sizes[0]} to {sizes[-1]}"
+            what = "frames" if cameras.have_images else "cameras without images"
+            lines.append(f"{split}: {len(cameras)} {what} of {shown}")
+        first, last = self.times
+        own = " to ".join(f"{self.world.clock.own(time):.10g}" for time in (first, last))
+        times = f"training from {first:.4g} to {last:.4g}, {own} by the data's clock"
+        lenses = [lens for cameras in self.cameras.values() for lens in cameras.intrinsics]
+        return [*lines, _lens_summary(lenses), f"times: {'one for all frames: static' if first == last else times}"]
+
     @classmethod
     def read(cls, folder: str | Path) -> "SceneRecord":
         """Read a run's `scene.json`.
@@ -119,6 +133,14 @@ class SceneRecord:
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             said = " ".join(str(error).split())[:200]
             raise ValueError(f"{path}: not a scene that this version has written ({said})") from error
+
+
+def _lens_summary(lenses: Sequence[Intrinsics]) -> str:
+    first = lenses[0]
+    bent = "" if first.distortion is None else f", {first.distortion.model} {first.distortion.radial}"
+    others = "" if len(set(lenses)) == 1 else f", one of {len(set(lenses))}"
+    focal = f"focal lengths {first.focal_x:.2f} and {first.focal_y:.2f} pixels"
+    return f"lens: {focal}, principal point {first.center[0]:.2f}, {first.center[1]:.2f}{bent}{others}"
 
 
 def _plain(cameras: CameraSet) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import yaml
 
 from dnerf.core.files import write_text
 from dnerf.data.frames import Frames
+from dnerf.planning.parts import Part
 
 FILE = "plan.yaml"
 WAYS = ("given", "images", "trial", "default")
@@ -92,6 +93,22 @@ def load_plan(path: Path) -> Plan:
         raise ValueError(f"plan.file: {path} must hold parts by name and the data's fingerprint")
     decisions = {str(name): _decision(f"plan.file: {path}: {name}", value) for name, value in parts.items()}
     return Plan(decisions, content.get("data", ""))
+
+
+def settled(parts: Mapping[str, Part], given: Mapping[str, object], file: Path | None, data: str) -> dict[str, str]:
+    """Candidates that stand already, by part: those given, else those of a saved plan.
+
+    Raises:
+        ValueError: for a part or a candidate that there is not, or a plan about other data than those of a fingerprint.
+    """
+    if file is not None:
+        saved = load_plan(file)
+        if saved.data and saved.data != data:
+            raise ValueError(f"plan.file: {file} is about another data set; leave it out, or the line data in it")
+        given = {**saved.choices, **given}
+    for name in given.keys() - parts.keys():
+        raise ValueError(f"plan.{name} is none of the parts {', '.join(parts)}")
+    return {name: parts[name].named(name, value) for name, value in given.items()}
 
 
 def _decision(where: str, value: Any) -> Decision:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dnerf.core.checks import check_whole
 from dnerf.deformations import ControlGraphDeformation, unwrapped
@@ -52,7 +52,9 @@ class PlaceNodes(Callback):
         if wanted <= int(self._done):
             return
         self._done.fill_(wanted)
-        graph, body = graph_of(run), self._body(run)
+        (field, graph), sampler = graph_of(run), run.renderer.sampler
+        assert isinstance(sampler, OccupancyAware)
+        body = self._body(run, field, sampler)
         if len(body) >= len(graph.nodes):
             graph.place(body[farthest_points(body, len(graph.nodes))])
             run.renderer.invalidate()
@@ -65,11 +67,9 @@ class PlaceNodes(Callback):
         """Go on with the next time."""
         self._done.copy_(state["done"])
 
-    def _body(self, run: Run) -> Tensor:
+    def _body(self, run: Run, field: DeformedField, sampler: OccupancyAware) -> Tensor:
         """Canonical places (N, 3) of much density."""
-        field, sampler, device = run.renderer.field, run.renderer.sampler, run.renderer.device
-        assert isinstance(field, DeformedField)
-        assert isinstance(sampler, OccupancyAware)
+        device = run.renderer.device
         generator = torch.Generator(device).manual_seed(run.step)
         unit = torch.rand(self.num_probes, 5, generator=generator, device=device)
         positions, times = sampler.occupied_positions(unit)
@@ -79,13 +79,15 @@ class PlaceNodes(Callback):
         return canonical[density > DENSE][:MOST_POINTS]
 
 
-def graph_of(run: Run) -> ControlGraphDeformation:
-    """The control graph of a run's model; ValueError if it has none."""
+def graph_of(run: Run) -> tuple[DeformedField, ControlGraphDeformation]:
+    """The field of a run's model, and its control graph; ValueError if it has none."""
     field = run.renderer.field
-    deformation = unwrapped(field.deformation) if isinstance(field, DeformedField) else field
-    if not isinstance(deformation, ControlGraphDeformation):
-        raise ValueError(f"PlaceNodes needs deformation=control_graph, got {type(deformation).__name__}; leave it out")
-    return deformation
+    found: nn.Module = field
+    if isinstance(field, DeformedField):
+        found = unwrapped(field.deformation)
+        if isinstance(found, ControlGraphDeformation):
+            return field, found
+    raise ValueError(f"PlaceNodes needs deformation=control_graph, got {type(found).__name__}; leave it out")
 
 
 def farthest_points(points: Tensor, count: int) -> Tensor:
