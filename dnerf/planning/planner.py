@@ -59,6 +59,7 @@ class _Planner:
     ) -> None:  # fmt: skip
         self.parts, self.make, self.frames, self.seed, self.share = parts, make, frames, seed, share
         self.callbacks = callbacks
+        self.lost_steps = 0  # of all losers
         self.decisions: dict[str, Decision] = {}
         self.standing = {name: Finding(part.default, "") for name, part in parts.items()}
         self.leading: Contender | None = None
@@ -117,11 +118,12 @@ class _Planner:
         contenders = [leading]
         for choice in others:
             contenders.append(leading.forked(choice, self.make, {**choices, name: choice}, learnt, self.seed))
-        before = [contender.run.seconds for contender in contenders]
+        before, first = [contender.run.seconds for contender in contenders], leading.run.step
         result = contest(contenders, HeldOut.of(held, self.seed), effort)
         winner, better, error = result.winner, result.gain, result.error
         spent = (c.run.seconds - b for c, b in zip(contenders, before, strict=True) if c is not winner)
         lost = result.seconds + sum(spent)
+        self.lost_steps += sum(c.run.step - first for c in contenders if c is not winner)
         second = "the others" if len(contenders) > 2 else next(c.choice for c in contenders if c is not winner)
         why = f"{effort.num_steps} steps, on held-out pixels, against {second}"
         finite = {"gain": better, "error": error} if math.isfinite(better) else {}
@@ -150,7 +152,8 @@ class _Planner:
         """What each candidate may spend for the budget's share to suffice."""
         limits, run = leading.trainer.limits, leading.run
         if limits.max_seconds is None:
-            return Effort(min(int(self.share * limits.num_steps / num_left / num_others), MOST_STEPS), 0.0)
+            left = self.share * limits.num_steps - self.lost_steps
+            return Effort(min(int(left / num_left / num_others), MOST_STEPS), 0.0)
         each = run.seconds / run.step
         spent = sum(decision.seconds for decision in self.decisions.values() if decision.by == "trial")
         budget = (self.share * limits.max_seconds - spent) / num_left

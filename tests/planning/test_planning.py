@@ -128,6 +128,14 @@ def test_trial_decides_and_its_winner_is_trained_on() -> None:
     assert run.renderer is not renderer
 
 
+def test_trials_of_several_parts_share_one_budget() -> None:
+    parts = {name: part() for name in ("first", "second", "third")}
+    plan, _ = make_plan(parts, {}, make, small_frames(24), share=0.09)
+    steps = [int(plan.decisions[name].why.split()[0]) for name in parts]
+    assert all(number >= LEAST_STEPS for number in steps)
+    assert sum(steps) <= 0.09 * 800
+
+
 def test_nothing_is_trained_for_what_is_given_seen_cannot_be_tried_or_does_not_arise() -> None:
     class Sees(Evidence):
         def find(self, frames: Frames) -> Finding:
