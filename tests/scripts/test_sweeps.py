@@ -10,6 +10,8 @@ import pytest
 import sweeps
 from launcher import Run, run_script
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = (
     "experiment=demo",
     "data.resolution=16",
