@@ -1,5 +1,6 @@
 """What scenes need: the plan's decisions, and what each is worth against its other candidates, trained to the end."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
@@ -33,7 +34,7 @@ def run(settings: Settings) -> SuiteResult:
         planned = [_train(settings, options, scene, seed, {}) for seed in options["seeds"]]
         for part in candidates:
             rows += _rows(settings, options, scene, part, candidates[part], planned)
-    wrong = [row for row in rows if row["verdict"] == "wrong"]
+    counts = Counter(row["verdict"] for row in rows)
     return SuiteResult(
         title="What scenes need",
         summary=(
@@ -51,12 +52,12 @@ def run(settings: Settings) -> SuiteResult:
             )
         ],
         findings=[
-            f"{len(rows)} decisions: {sum(row['verdict'] == 'right' for row in rows)} right, {len(wrong)} wrong, "
-            f"{sum(row['verdict'] == 'open' for row in rows)} within the noise of seeds.",
+            f"{len(rows)} decisions: {counts['right']} right, {counts['wrong']} wrong, {counts['open']} within noise.",
             *(
                 f"Wrong: {row['scene']}, {row['part']}: {row['choice']}, though {row['other']} scores "
                 f"{-row['worth_dB']:.2f} dB more."
-                for row in wrong
+                for row in rows
+                if row["verdict"] == "wrong"
             ),
         ],
     )

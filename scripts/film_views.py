@@ -3,6 +3,7 @@
 import math
 import sys
 from collections.abc import Sequence
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -15,18 +16,15 @@ from dnerf.data import SceneRecord
 from dnerf.visualization import (
     Surroundings,
     View,
+    film_times,
     fixed_path,
     make_views,
-    pingpong_times,
     pose_around,
     read_key_frames,
     read_nerfstudio_path,
-    slow_motion_times,
     spiral_path,
-    sweep_times,
 )
 
-TIME_PATHS = ("sweep", "pingpong", "slow")
 ROUNDING = 1e-6  # of the clock, beyond either end of what there is
 
 
@@ -161,33 +159,10 @@ def _resized(intrinsics: Intrinsics, resolution: int | ListConfig | None) -> Int
 
 
 def _times(config: DictConfig, scene: SceneRecord, count: int) -> list[float]:
-    time = "sweep" if config.time is None else config.time
-    if not isinstance(time, str):
-        return [_normalised("time", time, config, scene)] * count
-    check_choice("time", time, TIME_PATHS)
-    start, end = scene.times
-    if config.time_range is not None:
-        start, end = (_normalised("time_range", value, config, scene) for value in config.time_range)
-    if time == "slow":
-        slow = OmegaConf.to_container(config.slow_motion)
-        assert isinstance(slow, dict)
-        values = {str(name): value for name, value in slow.items()}
-        if config.clock == "data":
-            values["center"] = _normalised("slow_motion.center", values["center"], config, scene)
-            values["width"] /= scene.world.clock.length
-        return slow_motion_times(count, start=start, end=end, **values)
-    return (sweep_times if time == "sweep" else pingpong_times)(count, start, end)
-
-
-def _normalised(name: str, value: float, config: DictConfig, scene: SceneRecord) -> float:
-    """A time of a setting in [0, 1]."""
-    clock = scene.world.clock
-    time = clock.normalised(value) if config.clock == "data" else float(value)
-    if not -ROUNDING <= time <= 1 + ROUNDING:
-        low, high = (clock.own(0.0), clock.own(1.0)) if config.clock == "data" else (0, 1)
-        kinds = f"{', '.join(TIME_PATHS)} or a number" if name == "time" else "a number"
-        raise ValueError(f"{name} must be {kinds} in [{low:.10g}, {high:.10g}] by clock={config.clock}, got {value}")
-    return min(max(time, 0.0), 1.0)
+    clock, slow = scene.world.clock if config.clock == "data" else None, OmegaConf.to_container(config.slow_motion)
+    own = config.time_range is not None
+    limits, time = tuple(config.time_range) if own else scene.times, "sweep" if config.time is None else config.time
+    return film_times(count, time, limits, clock if own else None, clock, cast(Any, slow))
 
 
 def _warn_of_times(times: Sequence[float], scene: SceneRecord) -> None:

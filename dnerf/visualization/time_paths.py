@@ -1,10 +1,59 @@
 """Time paths: the time of every frame of a film."""
 
 import math
+from collections.abc import Mapping, Sequence
 
 import torch
 
-from dnerf.core.checks import check_positive
+from dnerf.core.checks import check_choice, check_positive
+from dnerf.data.normalization import Clock
+
+TIME_PATHS = ("sweep", "pingpong", "slow")
+ROUNDING = 1e-6  # of the clock, beyond either end of what there is
+
+
+def film_times(
+    num_frames: int,
+    time: str | float,
+    limits: Sequence[float] = (0.0, 1.0),
+    limits_clock: Clock | None = None,
+    clock: Clock | None = None,
+    slow_motion: Mapping[str, float] | None = None,
+) -> list[float]:
+    """Times of a film in [0, 1].
+
+    Args:
+        num_frames: of the film.
+        time: "sweep", "pingpong" or "slow" from the first limit to the second, or one time for all frames.
+        limits: two times.
+        limits_clock: of the limits; None if they are in [0, 1].
+        clock: of one time, and of the slow motion's centre and width; None if they are in [0, 1].
+        slow_motion: arguments of `slow_motion_times`.
+
+    Raises:
+        ValueError: for another word, or times out of range.
+    """
+    if not isinstance(time, str):
+        return [_normalised("time", time, clock)] * num_frames
+    check_choice("time", time, TIME_PATHS)
+    start, end = (_normalised("time_range", value, limits_clock) for value in limits)
+    if time != "slow":
+        return (sweep_times if time == "sweep" else pingpong_times)(num_frames, start, end)
+    slow = dict(slow_motion or {})
+    if clock is not None:
+        slow["center"] = _normalised("slow_motion.center", slow["center"], clock)
+        slow["width"] /= clock.length
+    return slow_motion_times(num_frames, start=start, end=end, **slow)
+
+
+def _normalised(name: str, value: float, clock: Clock | None) -> float:
+    """A time of a setting, by a clock, in [0, 1]."""
+    time = float(value) if clock is None else clock.normalised(value)
+    if not -ROUNDING <= time <= 1 + ROUNDING:
+        low, high, by = (0, 1, "run") if clock is None else (clock.own(0.0), clock.own(1.0), "data")
+        kinds = f"{', '.join(TIME_PATHS)} or a number" if name == "time" else "a number"
+        raise ValueError(f"{name} must be {kinds} in [{low:.10g}, {high:.10g}] by clock={by}, got {value}")
+    return min(max(time, 0.0), 1.0)
 
 
 def sweep_times(num_frames: int, start: float = 0.0, end: float = 1.0) -> list[float]:

@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import pytest
 
-from dnerf.visualization import pingpong_times, slow_motion_times, sweep_times
+from dnerf.data.normalization import Clock
+from dnerf.visualization import film_times, pingpong_times, slow_motion_times, sweep_times
 
 
 def test_a_sweep_has_even_steps_and_both_ends_and_a_pingpong_closes() -> None:
@@ -59,3 +60,18 @@ def test_slow_motion_of_factor_one_is_a_sweep_and_runs_backwards_too() -> None:
 def test_numbers_out_of_range_are_named(arguments: dict, named: str) -> None:
     with pytest.raises(ValueError, match=f"^{named} must be"):
         slow_motion_times(**arguments)
+
+
+def test_times_of_a_film_follow_a_clock_and_are_refused_beyond_it() -> None:
+    clock = Clock(10.0, 20.0)
+    assert film_times(3, 25.0, clock=clock) == [0.75] * 3
+    assert film_times(3, "sweep", (15.0, 20.0), clock) == pytest.approx([0.25, 0.375, 0.5])
+    assert film_times(2, "pingpong", (0.2, 0.6)) == pytest.approx([0.2, 0.6])
+    slow = {"center": 20.0, "width": 8.0, "factor": 4.0}
+    assert film_times(9, "slow", clock=clock, slow_motion=slow) == pytest.approx(
+        slow_motion_times(9, center=0.5, width=0.4, factor=4.0)
+    )
+    with pytest.raises(ValueError, match=r"time must be sweep, .* or a number in \[10, 30\] by clock=data, got 31"):
+        film_times(3, 31.0, clock=clock)
+    with pytest.raises(ValueError, match=r"time_range must be a number in \[0, 1\] by clock=run"):
+        film_times(3, "sweep", (0.0, 1.5))
