@@ -2,9 +2,8 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import fmean, stdev
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.runs import Run, run_training, warm_up
 from benchmarks.scenes import scene_overrides
@@ -15,8 +14,7 @@ QUICK = {"scenes": ["static"], "seconds": 2, "seeds": [0], "resolution": 32, "fr
 CLEAR = 2.0  # standard errors over seeds from which a candidate counts as better than another
 
 
-@dataclass(frozen=True)
-class Trained:
+class Trained(NamedTuple):
     """One run of `experiment=auto`, and what it decided."""
 
     run: Run
@@ -100,8 +98,7 @@ def _verdict(worth: float, error: float | None) -> str:
 def _train(
     settings: Settings, options: Mapping[str, Any], scene: str, seed: int, choices: Mapping[str, str]
 ) -> Trained:
-    name = "-".join(choices.values()) or "planned"
-    folder = settings.work_dir / f"{scene}-{name}-seed{seed}"
+    folder = settings.work_dir / f"{scene}-{'-'.join(choices.values()) or 'planned'}-seed{seed}"
     given = [f"plan.{part}={choice}" for part, choice in choices.items()]
     done = run_training(settings.train_command, [*_overrides(settings, options, scene, seed), *given], folder)
     return Trained(done, load_plan(folder / FILE))
