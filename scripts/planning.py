@@ -28,19 +28,19 @@ def parts_of(config: DictConfig) -> dict[str, Part]:
     return {} if node is None else {str(name): build(part, trusted=True) for name, part in node.items()}
 
 
-def given_choices(config: DictConfig, parts: Mapping[str, Part], data: str, folder: Path) -> dict[str, str]:
+def given_choices(config: DictConfig, parts: Mapping[str, Part], frames: Frames, folder: Path) -> dict[str, str]:
     """What is decided already: by the command line, or by a saved plan.
 
     Raises:
         ValueError: for a part or a candidate that there is not, or a plan of another data set.
     """
     given = {str(name): value for name, value in config.plan.items() if name not in SETTINGS and value is not None}
-    choices = settled(parts, given, None if config.plan.file is None else Path(config.plan.file), data)
-    touched = {_key(override) for override in given_overrides(folder)}
-    for name, part in parts.items():
-        defining = {_key(overrides[0]) for overrides in part.candidates.values() if overrides}
-        if name not in choices and defining & touched:
-            choices[name] = part.default  # what the command line says of it stands
+    choices = settled(parts, given, None if config.plan.file is None else Path(config.plan.file), fingerprint(frames))
+    said = given_overrides(folder)
+    for name, part in parts.items():  # what the command line says of one stands
+        first = {overrides[0]: choice for choice, overrides in part.candidates.items() if overrides}
+        if name not in choices and {_key(override) for override in first} & {_key(override) for override in said}:
+            choices[name] = next((first[override] for override in said if override in first), part.default)
     return choices
 
 
@@ -73,16 +73,15 @@ def composed(parts: Mapping[str, Part], choices: Mapping[str, str], task: Sequen
 def as_planned(config: DictConfig, parts: Mapping[str, Part], choices: Mapping[str, str], folder: Path) -> DictConfig:
     """The resolved config of the run in a folder with some choices, and with what was found in its data."""
     planned = composed(parts, choices, given_overrides(folder))
-    for name in ("box", "background"):
-        planned[name] = config[name]
+    planned.box, planned.background = config.box, config.background
     return resolved(planned)
 
 
 def decide(
-    config: DictConfig, parts: Mapping[str, Part], frames: Frames, device: torch.device, folder: Path
-) -> tuple[Plan, Run | None]:
-    """The plan, and what its trials have begun; ValueError as of `given_choices`."""
-    given = given_choices(config, parts, fingerprint(frames), folder)
+    config: DictConfig, parts: Mapping[str, Part], given: Mapping[str, str], frames: Frames, device: torch.device,
+    folder: Path,
+) -> tuple[Plan, Run | None]:  # fmt: skip
+    """The plan, and what its trials have begun."""
 
     def make(choices: Mapping[str, str]) -> tuple[Renderer, Trainer]:
         candidate = as_planned(config, parts, choices, folder)

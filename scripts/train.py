@@ -46,13 +46,15 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
     # The same seed in every process: they begin with one model.
     torch.manual_seed(config.seed)
     renderer, trainer = (build(config[name], trusted=True) for name in ("renderer", "trainer"))
+    parts = planning.parts_of(config)
+    given = planning.given_choices(config, parts, frames, folder_of(config)) if parts else {}
     folder = processes.from_first(lambda: held.enter_context(opened(config)))
     plan, begun = None, None
-    if parts := planning.parts_of(config):
+    if parts:
         if processes.size == 1:
-            plan, begun = planning.decide(config, parts, frames, device, folder)
+            plan, begun = planning.decide(config, parts, given, frames, device, folder)
         else:  # the first one decides, and training begins anew
-            plan = processes.from_first(lambda: planning.decide(config, parts, frames, device, folder)[0])
+            plan = processes.from_first(lambda: planning.decide(config, parts, given, frames, device, folder)[0])
         config = planning.as_planned(config, parts, plan.choices, folder)
         torch.manual_seed(config.seed)
         renderer, trainer = (build(config[name], trusted=True) for name in ("renderer", "trainer"))

@@ -1,6 +1,5 @@
 """Deciding what a scene needs: settings, then images, then trials, for at most a share of the training's budget."""
 
-import logging
 import math
 import time
 from collections.abc import Mapping
@@ -12,8 +11,6 @@ from dnerf.planning.plan import Decision, Plan, fingerprint
 from dnerf.planning.trials import Contender, Effort, HeldOut, Maker, contest, split_frames
 from dnerf.training.callbacks import Callback
 from dnerf.training.run import Run
-
-logger = logging.getLogger(__name__)
 
 LEAST_STEPS = 16  # of a trial: fewer tell nothing
 LEAST_DONE = 64  # steps of a model before its parts are tried: what helps a fresh one may not help for long

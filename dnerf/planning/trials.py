@@ -167,7 +167,7 @@ class Result:
 
 
 def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> Result:
-    """Train all, halving their number until one is left.
+    """Train all, halving the number of challengers until one is left.
 
     The first contender is the one that stands: another one wins only if it is better by two standard errors.
 
@@ -191,7 +191,8 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> R
             contender.compare(inside)
         seconds += time.perf_counter() - begin
         if len(left) > 2:
-            left = sorted(left, key=lambda c: float(c.errors.mean()))[: (len(left) + 1) // 2]
+            others = sorted(left[1:], key=lambda c: float(c.errors.mean()))
+            left = [left[0], *others[: len(others) // 2]]  # the one that stands is compared to the end
     for contender in contenders:
         contender.end()
     standing = contenders[0]

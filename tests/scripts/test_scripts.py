@@ -110,6 +110,7 @@ WRONG = [
     ("train", ("experiment=nosuch",), "experiment/nosuch"),
     ("train", ("scene=nosuch",), "scene/nosuch"),
     ("train", ("trainer.nosuch=1",), "nosuch"),
+    ("train", ("experiment=auto", "plan.motion=2", *TINY[:4]), "plan.motion must be one of still, moves"),
     ("train", ("+trainer.nosuch=1", *TINY[:4], "out_dir=fresh"), "trainer.nosuch is none of Trainer's arguments"),
     ("train", ("+trainer.losses.x={_target_: no.such.Loss}", *TINY[:4]), "trainer.losses.x._target_ names nothing"),
     ("train", ("+trainer.losses.x={_target_: os.system}", *TINY[:4]), "trainer.losses.x._target_ must be a class"),
