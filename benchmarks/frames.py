@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from benchmarks.runs import model_mib, run_training
@@ -77,7 +76,7 @@ def _measure(models: Mapping[str, Mapping[str, Any]], settings: Settings, scale:
     camera = frames.intrinsics[0]
     size = camera if scale == 1 else camera.resized(round(camera.width * scale), round(camera.height * scale))
     renderers: dict[str, Renderer] = {way: parts["renderer"].to(settings.device) for way, parts in models.items()}
-    background = renderers[OWN].background.eval()(torch.zeros(1, 3, device=settings.device))[0]
+    background = renderers[OWN].plain_background()
     truths = None if size is not camera else [frames.image(i, background) for i in chosen]
     calls = {
         way: partial(_images, renderer, frames, chosen, size, models[way]["chunk"])

@@ -183,7 +183,7 @@ def _write_consistency(
 
 
 def _exact_images(scene: AnalyticScene, renderer: Renderer, rays: Rays) -> Rendering:
-    rgb, opacity, depth = render_exact(scene, rays, renderer.background(rays.directions[:1])[0])
+    rgb, opacity, depth = render_exact(scene, rays, renderer.plain_background())
     return Rendering(rgb=rgb, opacity=opacity, depth=depth)
 
 

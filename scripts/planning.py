@@ -19,6 +19,7 @@ from dnerf.training.run import Run
 from dnerf.training.trainer import Trainer
 
 OVERRIDES = "overrides.json"  # in a run's folder
+FROM_DATA = "background_from_data"  # a setting: whether the background is the data's
 SETTINGS = ("parts", "share", "file")  # of a plan; all others are choices
 
 
@@ -73,7 +74,9 @@ def composed(parts: Mapping[str, Part], choices: Mapping[str, str], task: Sequen
 def as_planned(config: DictConfig, parts: Mapping[str, Part], choices: Mapping[str, str], folder: Path) -> DictConfig:
     """The resolved config of the run in a folder with some choices, and with what was found in its data."""
     planned = composed(parts, choices, given_overrides(folder))
-    planned.box, planned.background = config.box, config.background
+    planned.box = config.box
+    if planned.get(FROM_DATA):
+        planned.background = config.background
     return resolved(planned)
 
 

@@ -135,7 +135,7 @@ def _truth(
     """What gives the true image of each view: the data's own image, or the exact scene."""
     data = build(saved.data)
     data.settle(scene.world)
-    background = renderer.background(torch.zeros(1, 3, device=renderer.device))[0]
+    background = renderer.plain_background()
     if isinstance(data, SyntheticData):
         model = data.scene.to(renderer.device)
 

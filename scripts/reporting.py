@@ -103,7 +103,7 @@ def _differs(renderer: Renderer, color: tuple[float, float, float]) -> bool:
 
 
 def _color_name(renderer: Renderer) -> str:
-    color = tuple(renderer.background(torch.zeros(1, 3, device=renderer.device))[0].tolist())
+    color = tuple(renderer.plain_background().tolist())
     return next((name for name, known in COLORS.items() if known == color), str(color))
 
 

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from hydra_app import load_config, moved, resolved
 from omegaconf import DictConfig, OmegaConf, open_dict
-from planning import OVERRIDES, as_decided
+from planning import FROM_DATA, OVERRIDES, as_decided
 
 from dnerf.core.files import TEMPORARY, claimed, remove_leftovers, write_json, write_text
 from dnerf.data.scene_record import SCENE
@@ -37,7 +37,6 @@ CHANGEABLE = (
     "trainer.callbacks.box_warning",
 )
 OWN_FOLDERS = (CHECKPOINTS, "previews")
-FROM_DATA = "background_from_data"
 
 
 def continued(config: DictConfig) -> DictConfig:

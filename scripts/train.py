@@ -9,8 +9,9 @@ import planning
 import torch
 from hydra_app import build, resolve_device, resolved, run_app
 from omegaconf import DictConfig
+from planning import FROM_DATA
 from reporting import evaluate_run, print_scores
-from run_folder import FROM_DATA, continued, folder_of, opened, save_config
+from run_folder import continued, folder_of, opened, save_config
 
 from dnerf.core.backgrounds import ConstantBackground
 from dnerf.core.files import write_json
@@ -71,7 +72,7 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
         size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
         num_parameters = sum(p.numel() for p in renderer.parameters())
         print(f"{folder}: {len(frames)} frames of {size}, {num_parameters:,} parameters, on {renderer.device}")
-        for note in (*world.notes, *background, *unscored):
+        for note in (*world.notes, *(background if config.get(FROM_DATA) else ()), *unscored):
             print(note)
         for warning in (*world.warnings, *([said] if said else [])):
             print(f"warning: {warning}")

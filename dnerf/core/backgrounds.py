@@ -6,6 +6,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from dnerf.core.rays import Rays
+
 COLORS: dict[str, tuple[float, float, float]] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
@@ -26,10 +28,11 @@ class Background(nn.Module, ABC):
     """Colour behind each ray."""
 
     needs_alpha = False  # whether training needs images with alpha
+    is_costly = False  # whether to leave out rays through which no light gets
 
     @abstractmethod
-    def forward(self, directions: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
-        """Colours (R, 3) in [0, 1] behind rays with the given unit directions (R, 3)."""
+    def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Tensor:
+        """Colours (R, 3) in [0, 1] behind R rays."""
 
     def constant(self) -> Tensor | None:
         """The colour (3,) that is the same in all directions in evaluation mode; None if there may be several."""
@@ -47,9 +50,9 @@ class ConstantBackground(Background):
         super().__init__()
         self.color = nn.Buffer(torch.tensor(parse_color(color)), persistent=False)
 
-    def forward(self, directions: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+    def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Tensor:
         """One colour, expanded to (R, 3)."""
-        return self.color.to(directions.dtype).expand(directions.shape[0], 3)
+        return self.color.to(rays.origins.dtype).expand(len(rays), 3)
 
     def constant(self) -> Tensor | None:
         """The colour (3,)."""
@@ -68,11 +71,12 @@ class RandomBackground(ConstantBackground):
 
     needs_alpha = True
 
-    def forward(self, directions: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+    def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Tensor:
         """Random colours (R, 3) in training mode, the constant one in evaluation mode."""
         if not self.training:
-            return super().forward(directions)
-        return torch.rand(directions.shape[0], 3, generator=generator, dtype=directions.dtype, device=directions.device)
+            return super().forward(rays)
+        like = rays.origins
+        return torch.rand(len(rays), 3, generator=generator, dtype=like.dtype, device=like.device)
 
     def constant(self) -> Tensor | None:
         """The colour (3,) of evaluation mode."""

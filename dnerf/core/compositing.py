@@ -9,7 +9,7 @@ opacity of an interval is `-expm1(-tau)` (exact for thin ones), and sums run per
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -157,15 +157,20 @@ def composite(
     )
     sums = sum_along_rays(columns, samples, weights)
     rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
-    if background is not None:
-        if background.shape != (3,):
-            check_shape("background", background, (samples.num_rays, 3))
-        background = background.to(rgb.dtype).expand(samples.num_rays, 3)
-        rgb = rgb + (1 - opacity)[:, None] * background
-    return Rendering(
-        rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity, FAINT), background=background, weights=weights,
-        samples=samples, output=output,
+    rendering = Rendering(
+        rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity, FAINT), weights=weights, samples=samples,
+        output=output,
     )  # fmt: skip
+    return rendering if background is None else over(rendering, background)
+
+
+def over(rendering: Rendering, background: Tensor) -> Rendering:
+    """A rendering of R rays without a background, over one, (R, 3) or (3,); ValueError for another shape."""
+    if background.shape != (3,):
+        check_shape("background", background, (len(rendering.rgb), 3))
+    background = background.to(rendering.rgb.dtype).expand(len(rendering.rgb), 3)
+    rgb = rendering.rgb + (1 - rendering.opacity)[:, None] * background
+    return replace(rendering, rgb=rgb, background=background)
 
 
 def median_depth(rendering: Rendering) -> Tensor:

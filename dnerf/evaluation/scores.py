@@ -72,7 +72,7 @@ def evaluate(
     frames = frames.to(device)
     was_training = renderer.training
     renderer.eval()
-    background = renderer.background(torch.zeros(1, 3, device=device))[0]
+    background = renderer.plain_background()
     scores, seconds = [], []
     for i in spread_indices(len(frames), max_frames):
         camera, frame_time = frames.camera(i), float(frames.times[i])

@@ -98,7 +98,7 @@ def evaluate_over_time(
     common: dict[str, Any] = {"num_frames": num_frames, "time_step": times[1], "flicker": flicker(film.images)}
     if scene is None:
         return TemporalScores(motion="model", **common, **_means([_own_row(film, i) for i in range(num_frames - 1)]))
-    background = renderer.background(torch.zeros(1, 3, device=camera.pose.device))[0]
+    background = renderer.plain_background()
     truth = _shoot(lambda time: _exact_image(scene, camera, time, background), scene, camera, times, chunk)
     flows = [exact_flow(scene, camera, first, camera, second) for first, second in itertools.pairwise(times)]
     scores, floors = (_means([_exact_row(f, i, flow) for i, flow in enumerate(flows)]) for f in (film, truth))

@@ -6,8 +6,9 @@ from dnerf.fields.deformed import CachedField, DeformedField
 from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
 from dnerf.fields.space_time import SpaceTimeVolumes
+from dnerf.fields.surroundings import Surroundings
 
 __all__ = [
     "CachedField", "DeformedField", "FieldOutput", "GridField", "NeRFField", "NetworkTabled",
-    "RadianceField", "SpaceTimeVolumes", "TimeDependence", "evaluate_along_rays",
+    "RadianceField", "SpaceTimeVolumes", "Surroundings", "TimeDependence", "evaluate_along_rays",
 ]  # fmt: skip

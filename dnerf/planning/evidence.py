@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from dnerf.core.geometry import ray_box
+from dnerf.data.background_check import background_color
 from dnerf.data.bounds import fit_box
 from dnerf.data.carving import Silhouettes
 from dnerf.data.frames import Frames
@@ -54,6 +55,21 @@ class MotionEvidence(Evidence):
         if share <= CLEAR_SHARE:
             return Finding("still", "all outlines agree with a body at rest", is_certain=False)
         return Finding("moves", f"{100 * share:.0f} % of the outlines contradict a body at rest")
+
+
+class SurroundingsEvidence(Evidence):
+    """Whether something lies beyond the box: candidates "alone" and "surrounded".
+
+    Images with alpha, or before one plain colour, show a scene that stands alone; others show something everywhere.
+    """
+
+    def find(self, frames: Frames) -> Finding:
+        """See `Evidence.find`."""
+        if frames.is_transparent:
+            return Finding("alone", "the images have alpha")
+        if background_color(frames) is not None:
+            return Finding("alone", "the images have one plain colour behind")
+        return Finding("surrounded", "the images show something everywhere")
 
 
 def unexplained_share(frames: Frames) -> float:

@@ -78,10 +78,14 @@ class _Planner:
             else:
                 self.standing[name] = finding
 
-    def _choices(self) -> dict[str, str]:
-        """Those made, and defaults for all others."""
-        defaults = {name: finding.choice for name, finding in self.standing.items()}
-        return defaults | {name: decision.choice for name, decision in self.decisions.items()}
+    def _choices(self, **tried: str) -> dict[str, str]:
+        """Those made or tried, defaults for all others, the simplest where a question does not arise."""
+        choices = {name: finding.choice for name, finding in self.standing.items()}
+        choices |= {name: decision.choice for name, decision in self.decisions.items()} | tried
+        for name, part in self.parts.items():
+            if name not in self.decisions and not part.arises(choices):
+                choices[name] = next(iter(part.candidates))
+        return choices
 
     def decide(self) -> tuple[Plan, Run | None]:
         """See `make_plan`."""
@@ -103,18 +107,17 @@ class _Planner:
         return plan, None if self.leading is None else self.leading.run
 
     def _try(self, name: str, learnt: Frames, held: Frames, num_left: int) -> None:
-        part, choices = self.parts[name], self._choices()
-        leading = self._leading(learnt, choices, part.at)
+        part, standing = self.parts[name], self.standing[name].choice
+        leading = self._leading(learnt, self._choices(), part.at)
         effort = self._effort(leading, len(part.candidates) - 1, num_left)
         if effort.num_steps < LEAST_STEPS or leading.run.step < LEAST_DONE:
             self.decisions[name] = self._untried(name, "the budget is too small to try")
             return
-        standing = self.standing[name].choice
         others = [choice for choice in part.candidates if choice != standing]
         leading.choice = standing
         contenders = [leading]
         for choice in others:
-            contenders.append(leading.forked(choice, self.make, {**choices, name: choice}, learnt, self.seed))
+            contenders.append(leading.forked(choice, self.make, self._choices(**{name: choice}), learnt, self.seed))
         before, first = [contender.run.seconds for contender in contenders], leading.run.step
         result = contest(contenders, HeldOut.of(held, self.seed), effort)
         winner, better, error = result.winner, result.gain, result.error
@@ -123,7 +126,7 @@ class _Planner:
         self.lost_steps += sum(c.run.step - first for c in contenders if c is not winner)
         second = "the others" if len(contenders) > 2 else next(c.choice for c in contenders if c is not winner)
         why = f"{effort.num_steps} steps, on held-out pixels, against {second}"
-        finite = {"gain": better, "error": error} if math.isfinite(better) else {}
+        finite = {"gain": better, "error": error} if math.isfinite(better + error) else {}
         self.decisions[name] = Decision(winner.choice, "trial", why, seconds=lost, **finite)
         winner.run.seconds += lost
         winner.run.callbacks = leading.run.callbacks

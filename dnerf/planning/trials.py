@@ -143,7 +143,8 @@ def split_frames(frames: Frames) -> tuple[Frames, Frames] | None:
 def gain(better: Tensor, worse: Tensor) -> tuple[float, float]:
     """By how much some errors (F,) are smaller than others, in dB, and the standard error of that.
 
-    The frames are taken as independent, their differences as paired: what both candidates find hard does not count.
+    The frames are taken as independent, their differences as paired: what both candidates find hard does not count. The
+    error is infinite for a single frame, which says nothing of others.
     """
     if not bool(better.isfinite().all()):
         return -math.inf, 0.0
@@ -152,8 +153,11 @@ def gain(better: Tensor, worse: Tensor) -> tuple[float, float]:
     differences = 10 * (worse.clamp(min=1e-12) / better.clamp(min=1e-12)).log10()
     share = worse / worse.sum().clamp(min=1e-30)  # of the whole error: a frame without any says nothing
     mean = float((share * differences).sum())
+    count = len(share)
+    if count < 2:
+        return mean, math.inf
     spread = float((share.square() * (differences - mean).square()).sum().sqrt())
-    return mean, spread
+    return mean, spread * math.sqrt(count / (count - 1))  # the mean is theirs
 
 
 @dataclass(frozen=True)

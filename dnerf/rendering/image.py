@@ -43,7 +43,7 @@ def image_columns(
     numbers, rays, grid = None, None, None
     if _is_plain(renderer) and isinstance(sampler, OccupancyAware) and speaks_for(sampler, "march_grid", "forward"):
         grid = sampler.march_grid(time, camera.pose.dtype)
-        visible = sampler.visible_rays(camera, time)
+        visible = None if renderer.background.is_costly else sampler.visible_rays(camera, time)
         if visible is not None:
             numbers, rays = visible
     rays = camera.rays(time) if rays is None else rays
@@ -152,7 +152,7 @@ def _marched(sampler: FrontToBack, rays: Rays) -> Source:
 def _over_background(renderer: "Renderer", rays: Rays, sums: Tensor) -> Rendering:
     """What rays show that meet rgb, depth times opacity, and opacity, (R, 5), before the background."""
     rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
-    rgb = rgb + (1 - opacity)[:, None] * renderer.background(rays.directions)
+    rgb = rgb + (1 - opacity)[:, None] * renderer.behind(rays, opacity)
     return Rendering(rgb=rgb, opacity=opacity, depth=safe_divide(depth, opacity))
 
 
@@ -180,7 +180,7 @@ def _empty(renderer: "Renderer", camera: Camera, time: float) -> Tensor:
     background = renderer.background
     color = background.constant() if speaks_for(background, "constant", "forward") else None
     if color is None:
-        color = background(camera.rays(time).directions)
+        color = background(camera.rays(time))
     image = camera.pose.new_zeros(size, 5)
     image[:, :3] = color
     return image

@@ -4,12 +4,12 @@ from dataclasses import replace
 from itertools import chain
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dnerf.core.backgrounds import Background, ConstantBackground
 from dnerf.core.cameras import Camera
 from dnerf.core.checks import check_choice, check_positive
-from dnerf.core.compositing import Rendering, composite
+from dnerf.core.compositing import Rendering, composite, over
 from dnerf.core.quadrature import check_rule
 from dnerf.core.rays import Rays, Samples
 from dnerf.core.schedules import Scheduled
@@ -19,6 +19,7 @@ from dnerf.rendering.frame_graphs import FrameGraphs
 from dnerf.rendering.image import image_columns
 from dnerf.samplers.base import Capacity, FixedCapacity, Sampler
 
+LEAST_LIGHT = 1e-3  # a quarter of a step of eight bits, behind which a costly background is left out
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
 
 
@@ -106,14 +107,29 @@ class Renderer(nn.Module):
         if self.training:
             density = torch.where(samples.lengths > 0, output.density.detach(), 0)  # of padding: nothing
             self.sampler.observe(positions.detach(), times, density)
-        background = self.background(rays.directions, generator=generator)
-        rendering = composite(samples, output, background, quadrature=self.quadrature)
+        rendering = composite(samples, output, quadrature=self.quadrature)
+        background = self.behind(rays, rendering.opacity, generator)
+        rendering = over(rendering, background)
         if not samples.proposals:
             return rendering
         proposals = tuple(
             composite(placed, said, background, quadrature=self.quadrature) for placed, said in samples.proposals
         )
         return Rendering(**{**vars(rendering), "proposals": proposals})
+
+    def behind(self, rays: Rays, opacity: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Colours (R, 3) behind rays of such opacity (R,); black where a costly background could not be seen."""
+        with self.autocast(rays.origins.device):
+            if not self.background.is_costly or opacity.is_cuda:  # numbers of rays are known on the GPU only
+                return self.background(rays, generator=generator)
+            seen = (opacity.detach() < 1 - LEAST_LIGHT).nonzero()[:, 0]
+            colors = self.background(rays[seen], generator=generator)
+        return rays.origins.new_zeros(len(rays), 3).index_copy(0, seen, colors.to(rays.origins.dtype))
+
+    def plain_background(self) -> Tensor:
+        """The colour (3,) on which images with alpha are compared with this model's; black if it has several."""
+        color = self.background.constant() if speaks_for(self.background, "constant", "forward") else None
+        return torch.zeros(3, device=self.device) if color is None else color
 
     def update(self, step: int) -> None:
         """Let the sampler learn from the field, between training steps; `step` counts those done."""

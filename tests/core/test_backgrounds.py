@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from dnerf.core.backgrounds import ConstantBackground, RandomBackground, parse_color
+from dnerf.core.rays import Rays
 
-DIRECTIONS = torch.zeros(1000, 3)
+RAYS = Rays(torch.zeros(1000, 3), torch.zeros(1000, 3), *torch.zeros(3, 1000))
 
 
 def seeded(seed: int) -> torch.Generator:
@@ -20,7 +21,7 @@ def seeded(seed: int) -> torch.Generator:
 )
 def test_colours_have_names_or_numbers(color: object, expected: tuple[float, ...]) -> None:
     assert parse_color(color) == expected
-    background = ConstantBackground(color)(DIRECTIONS)
+    background = ConstantBackground(color)(RAYS)
     assert background.shape == (1000, 3)
     assert (background == torch.tensor(expected)).all()
 
@@ -32,7 +33,7 @@ def test_other_colours_are_refused(color: object) -> None:
 
 
 def test_random_background_is_another_uniform_colour_for_every_ray_in_training() -> None:
-    colors = RandomBackground("black").train()(DIRECTIONS, generator=seeded(0))
+    colors = RandomBackground("black").train()(RAYS, generator=seeded(0))
     assert len(colors.unique(dim=0)) == 1000
     assert 0 <= colors.min() < 0.01 < 0.99 < colors.max() <= 1
     # The mean of 1000 uniform numbers, within four standard deviations.
@@ -40,7 +41,7 @@ def test_random_background_is_another_uniform_colour_for_every_ray_in_training()
 
 
 @pytest.mark.parametrize("background", [ConstantBackground("white"), RandomBackground()])
-def test_background_has_the_dtype_of_the_directions(background: ConstantBackground) -> None:
-    assert background(DIRECTIONS.double()).dtype == torch.float64
-    assert background(DIRECTIONS[:0]).shape == (0, 3)
+def test_background_has_the_dtype_of_the_rays(background: ConstantBackground) -> None:
+    assert background(RAYS.to(torch.float64)).dtype == torch.float64
+    assert background(RAYS[:0]).shape == (0, 3)
     assert background.state_dict() == {}

@@ -12,7 +12,7 @@ from small_runs import BOX, small_frames, small_renderer, small_trainer, weights
 from dnerf.core.backgrounds import RandomBackground
 from dnerf.data import Frames, SyntheticData
 from dnerf.fields import GridField
-from dnerf.planning import Decision, Evidence, Finding, MotionEvidence, Part, Plan, make_plan
+from dnerf.planning import Decision, Evidence, Finding, MotionEvidence, Part, Plan, SurroundingsEvidence, make_plan
 from dnerf.planning.plan import fingerprint, load_plan
 from dnerf.planning.planner import LEAST_STEPS
 from dnerf.planning.trials import Contender, Effort, HeldOut, contest, gain, split_frames
@@ -55,6 +55,7 @@ def test_gain_is_the_ratio_of_whole_errors_for_equal_ratios_and_has_no_spread_th
     mean, error = gain(worse / 2, worse)
     assert mean == pytest.approx(10 * math.log10(2))
     assert error == pytest.approx(0)
+    assert gain(worse[:1] / 2, worse[:1])[1] == math.inf  # one frame says nothing of others
     assert gain(torch.tensor([math.nan]), worse[:1]) == (-math.inf, 0.0)
     assert gain(worse[:1], torch.tensor([math.inf])) == (math.inf, 0.0)
 
@@ -126,6 +127,29 @@ def test_trial_decides_and_its_winner_is_trained_on() -> None:
     record = trainer.fit(run.renderer, small_frames(24), begun=run)
     assert record.step == 800
     assert run.renderer is not renderer
+
+
+def test_candidates_are_made_without_what_does_not_arise_with_them() -> None:
+    made: list[Mapping[str, str]] = []
+
+    def noting(choices: Mapping[str, str]) -> tuple[Renderer, Trainer]:
+        made.append(dict(choices))
+        return make(choices)
+
+    richer = Part("what else", CANDIDATES, "quick", at=0.3, only_if={"rate": "slow"})
+    plan, run = make_plan({"rate": part(), "other": richer}, {}, noting, small_frames(24), share=0.05)
+    assert made == [{"rate": "slow", "other": "quick"}, {"rate": "quick", "other": "slow"}]
+    assert run is not None
+    assert plan.choices == made[-1]  # whose run goes on
+
+
+def test_images_that_show_something_everywhere_have_surroundings() -> None:
+    frames = frames_of("walker", 8, 16)
+    assert SurroundingsEvidence().find(frames).choice == "alone"
+    opaque = replace(frames, images=frames.images[..., :3].contiguous())
+    assert SurroundingsEvidence().find(opaque).choice == "alone"  # before white, or black
+    noise = torch.randint(256, opaque.images.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    assert SurroundingsEvidence().find(replace(opaque, images=noise)).choice == "surrounded"
 
 
 def test_trials_of_several_parts_share_one_budget() -> None:

@@ -281,8 +281,8 @@ def test_overrides_of_subclasses_are_honoured_in_images(name: str, fused: list[T
 
 def test_overrides_of_backgrounds_are_honoured_where_nothing_is() -> None:
     class Sky(ConstantBackground):
-        def forward(self, directions: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
-            return 0.5 + 0.5 * directions
+        def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Tensor:
+            return 0.5 + 0.5 * rays.directions
 
     renderer = model()
     renderer.background = Sky()

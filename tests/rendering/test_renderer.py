@@ -38,8 +38,8 @@ def some_camera(width: int = 7, height: int = 5) -> Camera:
 class Sky(Background):
     """A colour for each direction."""
 
-    def forward(self, directions: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
-        return 0.5 + 0.5 * directions
+    def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Tensor:
+        return 0.5 + 0.5 * rays.directions
 
 
 SAMPLERS = {"stratified": lambda: StratifiedSampler(16), "importance": lambda: ImportanceSampler(12, 12, soft_ball())}
