@@ -25,11 +25,11 @@ CENTER = np.array([0.3, -0.2, 0.1])
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenGL's axes and OpenCV's
 
 
-def poses() -> np.ndarray:
-    """(4, 4, 4) camera to world, OpenGL's axes: on a circle of radius 4, 1.5 above the point that they look at."""
+def poses(count: int = NUM_FRAMES) -> np.ndarray:
+    """(F, 4, 4) camera to world, OpenGL's axes: on a circle of radius 4, 1.5 above the point that they look at."""
     result = []
-    for index in range(NUM_FRAMES):
-        angle = 0.4 + index * math.tau / NUM_FRAMES
+    for index in range(count):
+        angle = 0.4 + index * math.tau / count
         back = np.array([4 * math.cos(angle), 4 * math.sin(angle), 1.5])
         position, back = CENTER + back, back / np.linalg.norm(back)
         right = np.cross([0.0, 0.0, 1.0], back)

@@ -21,6 +21,7 @@ from dnerf.data.source import DataSource, NoImages, check_train_end, given_box
 from dnerf.data.splits import TIMES, SplitFrames, split_frames
 
 Z_UP = (0.0, 0.0, 1.0)
+PIXELS = 2**20  # looked at together
 
 
 class FolderData(DataSource):
@@ -131,8 +132,9 @@ class FolderData(DataSource):
         splits = self._split.splits
         if split not in splits:
             raise NoImages(
-                f"{self.capture.path}: there is no {split} split, only {', '.join(splits)}; data.hold_out=8 makes a "
-                "test split of every eighth training frame, evaluate_split=null scores none"
+                f"{self.capture.path}: there is no {split} split, only {', '.join(splits)}; "
+                f"data.hold_out={min(8, len(splits['train']))} makes a test split of training frames, "
+                "evaluate_split=null scores none"
             )
         if not any(frame.image is not None for frame in splits[split]):
             raise NoImages(
@@ -150,7 +152,13 @@ class FolderData(DataSource):
         return frames
 
     def _load(self, split: str) -> LoadedFrames:
-        return load_frames(self._read_of(split), resolution=self.resolution)
+        loaded = load_frames(self._read_of(split), resolution=self.resolution)
+        if split == "train" and not _show_something(loaded.images):
+            raise ValueError(
+                f"{self.capture.path}: all pixels of the {len(loaded.frames)} training images are alike, they show "
+                "nothing: export them again, with what is to be learnt in view"
+            )
+        return loaded
 
     def _placed(self, loaded: LoadedFrames) -> World:
         stated = self.capture.up
@@ -187,6 +195,12 @@ class FolderData(DataSource):
             )
         red, green, blue = color.tolist()
         return replace(frames, background=(red, green, blue))
+
+
+def _show_something(images: Tensor) -> bool:
+    """Whether any pixel differs from the first; what is larger than memory is read as far as is needed only."""
+    pixels = images.flatten(0, -2)
+    return any(bool((part != pixels[0]).any()) for part in pixels.split(PIXELS))
 
 
 def _is_there(frame: CaptureFrame) -> bool:

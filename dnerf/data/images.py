@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFile
 
+from dnerf.data.file_kinds import HEAD, what_else
+
 MAX_PIXELS = 2**25
 MAX_SIDE = 2**14
 FORMATS = ("PNG", "JPEG")
@@ -212,7 +214,9 @@ def _open(path: Path) -> ImageFile.ImageFile:
     except FileNotFoundError:
         raise ValueError(f"{path}: image does not exist") from None
     except Image.UnidentifiedImageError:
-        raise ValueError(f"{path}: image must be a {' or '.join(FORMATS)} file") from None
+        with path.open("rb") as file:
+            said = what_else(file.read(HEAD), "convert it, or copy it again")
+        raise ValueError(f"{path}: image must be a {' or '.join(FORMATS)} file; {said}") from None
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise ValueError(f"{path}: {_one_line(error)}") from error
     except (OSError, SyntaxError, ValueError, struct.error) as error:
@@ -221,7 +225,7 @@ def _open(path: Path) -> ImageFile.ImageFile:
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
         problem = f"at most {MAX_PIXELS} pixels and {MAX_SIDE} on a side, got {width} x {height}"
     elif image.mode not in MODES:
-        problem = f"grey, palette, RGB or RGBA, got {image.mode}"
+        problem = f"grey, palette, RGB or RGBA, got {image.mode}: convert it"
     else:
         return image
     image.close()

@@ -94,8 +94,10 @@ def _undone(poses: Tensor, path: Path) -> Tensor:
 
 def _rigid(poses: Tensor, path: str | Path) -> Tensor:
     """Poses whose rotations are made exact; ValueError if they are none."""
+    if not bool(poses.isfinite().all()):  # the decomposition would raise another error
+        raise ValueError(f"{path}: cameras must be at finite places; correct scale and transform")
     left, sizes, right = torch.linalg.svd(poses[:, :3, :3])
-    if not bool(poses.isfinite().all()) or bool(((sizes - 1).abs() > 1e-2).any()):
+    if bool(((sizes - 1).abs() > 1e-2).any()):
         raise ValueError(f"{path}: cameras must be rotated and moved, not scaled")
     result = poses.clone()
     result[:, :3, :3] = left @ right

@@ -242,7 +242,9 @@ def test_masks_are_averaged_to_their_images_and_of_other_shapes_refused(tmp_path
         (png(100_000, 1), "at most 33554432 pixels and 16384 on a side, got 100000 x 1"),
         (png(8000, 8000), "at most 33554432 pixels and 16384 on a side, got 8000 x 8000"),
         (png(0, 0), "image"),
-        (b"", "image must be a PNG or JPEG file"),
+        (b"", "image must be a PNG or JPEG file; it is empty: copy or export it again"),
+        (b"<!DOCTYPE html>", "image must be a PNG or JPEG file; it is a web page"),
+        (b"\0\0\0\x18ftypheic", "image must be a PNG or JPEG file; it is HEIC"),
         (b"\x89PNG\r\n\x1a\n", "image"),
         (b"not an image at all, although it is long enough", "image must be a PNG or JPEG file"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 3\n", "image must be a PNG or JPEG file"),
@@ -272,7 +274,7 @@ def test_a_palette_image_without_a_palette_is_refused(tmp_path: Path) -> None:
 
 def test_cmyk_and_another_size_than_promised_are_refused(tmp_path: Path) -> None:
     path = save(Image.new("CMYK", (4, 3)), tmp_path / "a.jpg")
-    with pytest.raises(ValueError, match="image must be grey, palette, RGB or RGBA, got CMYK"):
+    with pytest.raises(ValueError, match="image must be grey, palette, RGB or RGBA, got CMYK: convert it"):
         read_header(path)
     path = save(Image.new("RGB", (4, 3)), tmp_path / "a.png")
     with pytest.raises(ValueError, match="image must be 5 x 3, got 4 x 3"):

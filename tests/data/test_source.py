@@ -125,6 +125,16 @@ def test_opaque_test_images_beside_transparent_training_images_say_what_they_sta
         FolderData(root).frames("test")
 
 
+@pytest.mark.parametrize("mode", ["RGBA", "RGB"])
+def test_training_images_that_show_nothing_are_refused(folder, tmp_path, mode):
+    root = Path(shutil.copytree(folder, tmp_path / "scene"))
+    images_of(root, "train", lambda image: Image.new(mode, image.size))
+    with pytest.raises(ValueError, match="all pixels of the 11 training images are alike, they show nothing"):
+        FolderData(root).frames("train")
+    Image.new(mode, (8, 8), "white").save(root / "train/r_007.png")
+    assert len(FolderData(root, box=[[-1.0] * 3, [1.0] * 3]).frames("train")) == 11
+
+
 def test_splits_without_images_have_cameras_and_no_frames(folder, tmp_path):
     root = Path(shutil.copytree(folder, tmp_path / "scene"))
     shutil.rmtree(root / "test")

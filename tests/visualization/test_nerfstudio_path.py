@@ -77,3 +77,11 @@ def test_what_is_no_path_is_refused_in_one_line(tmp_path, value, message) -> Non
     with pytest.raises(ValueError, match=message) as error:
         read_nerfstudio_path(written(tmp_path / "path.json", value))
     assert "path.json" in str(error.value)
+
+
+@pytest.mark.parametrize("scale", [1e-320, 1e-308])
+def test_a_scale_that_moves_cameras_out_of_all_numbers_is_refused(tmp_path, scale) -> None:
+    """Found by fuzzing: an error of the singular value decomposition."""
+    given = written(tmp_path / "transforms.json", {"transform": torch.eye(4)[:3].tolist(), "scale": scale})
+    with pytest.raises(ValueError, match=r"transforms\.json: cameras must be at finite places; correct scale"):
+        read_nerfstudio_path(written(tmp_path / "path.json", content()), given)

@@ -12,6 +12,11 @@ from dnerf.data.formats.axes import check_axes
 
 AXES = ("auto", "opengl", "opencv")
 MAX_SUBFOLDERS = 200
+LISTING_SUFFIXES = (".json", ".npy", ".bin", ".txt")
+PACKED = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
+
+
+POSES = "images and films alone do not say where cameras stood: COLMAP, or nerfstudio's ns-process-data, finds out"
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,11 @@ def read_capture(root: str | Path, format: str = "auto", *, axes: str = "auto") 
     if not isinstance(root, str | Path) or "\0" in str(root):
         raise ValueError(f"root must be a data set's folder, got {root!r}")
     root = Path(root).expanduser()
-    root = root.parent if os.path.isfile(root) else root
+    if os.path.isfile(root):
+        if root.suffix not in LISTING_SUFFIXES:
+            said = "unpack it" if root.suffix in PACKED else POSES
+            raise ValueError(f"root must be a data set's folder, got the file {root}; {said}")
+        root = root.parent
     if not os.path.isdir(root):
         raise ValueError(f"root must be a data set's folder, got {root}")
     try:
@@ -87,5 +96,5 @@ def _not_recognised(root: Path) -> str:
     wanted = ", ".join(f"{reader.looks_for} ({name})" for name, reader in FORMATS.items())
     below = [path for path in sorted(root.iterdir())[:MAX_SUBFOLDERS] if path.is_dir()]
     known = [path.name for path in below if any(reader.recognises(path) for reader in FORMATS.values())]
-    hint = f"; but {known[0]!r} below it is one" if known else ""
+    hint = f"; but {known[0]!r} below it is one" if known else f"; {POSES}"
     return f"{root}: no data set is recognised, none of {wanted} lies there{hint}"

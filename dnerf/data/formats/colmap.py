@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from reprlib import repr as short
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from dnerf.core.lenses import Distortion
 from dnerf.data.capture import Capture, CaptureFrame, ImageFile
 from dnerf.data.formats.colmap_model import CameraModel, RegisteredImage, read_cameras, read_images, read_points
 from dnerf.data.formats.folder import Folder
-from dnerf.data.formats.json_files import MAX_NUMBER, Notes
+from dnerf.data.formats.json_files import MAX_NUMBER, Notes, short
 from dnerf.data.formats.manifest import unique
 from dnerf.data.formats.manifest_cameras import MAX_FOCAL_RATIO, MAX_SIDE
 from dnerf.data.formats.names import frame_numbers

@@ -8,11 +8,10 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from reprlib import repr as short
 
 import numpy as np
 
-from dnerf.data.formats.json_files import MAX_FRAMES, MAX_NUMBER, read_bytes
+from dnerf.data.formats.json_files import MAX_FRAMES, MAX_NUMBER, read_bytes, short
 from dnerf.data.formats.points import MAX_POINTS
 
 MAX_BYTES = 2**29

@@ -2,12 +2,12 @@
 
 import os
 from pathlib import Path, PureWindowsPath
-from reprlib import repr as short
 from typing import Any
 
-from dnerf.data.formats.json_files import Notes, text
+from dnerf.data.formats.json_files import Notes, short, text
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+OTHER_SUFFIXES = (".webp", ".gif", ".tif", ".tiff", ".bmp", ".exr", ".heic", ".avif")  # of images not read
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".MP4", ".MOV", ".AVI")
 REDUCED = ("images_2", "images_4", "images_8")  # what COLMAP's and nerfstudio's tools write beside images/
 MAX_PARTS = 64
@@ -71,6 +71,10 @@ class Folder:
             return []
         paths = sorted(p for p in folder.iterdir() if p.name.endswith(suffixes) and not p.name.startswith("."))
         return [self.inside(path, str(folder)) for path in paths if path.is_file()]
+
+    def other_kind(self, path: Path) -> Path | None:
+        """A file of a missing image's name with another suffix, if there is one beside it."""
+        return next((found for suffix in OTHER_SUFFIXES if (found := Path(f"{path}{suffix}")).is_file()), None)
 
     def name(self, path: Path) -> str:
         """A file's name for messages: relative to the folder, without its suffix."""

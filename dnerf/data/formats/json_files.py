@@ -5,16 +5,27 @@ import math
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from reprlib import repr as short
+from reprlib import Repr
 from typing import Any
 
 import numpy as np
+
+from dnerf.data.file_kinds import what_else
 
 MAX_BYTES = 16 * 2**20
 MAX_FRAMES = 10_000
 MAX_NOTES = 100
 MAX_LETTERS = 1000
+MAX_SHOWN = 120  # letters of a value in a message
+_SHOWN = Repr()
+_SHOWN.maxlevel = 2
 MAX_NUMBER = 1e9  # keeps sums of squares finite in float32; real scenes lie within thousands
+
+
+def short(value: Any) -> str:
+    """A value in at most 120 letters, for messages."""
+    shown = _SHOWN.repr(value)
+    return shown if len(shown) <= MAX_SHOWN else shown[: MAX_SHOWN - 3] + "..."
 
 
 class Notes:
@@ -54,13 +65,27 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not UTF-8 at byte {error.start}") from None
+        said = what_else(data, "save it as UTF-8")
+        raise ValueError(f"{path}: not UTF-8 at byte {error.start}; {said}") from None
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: malformed JSON at line {error.lineno} column {error.colno}: {error.msg}") from None
+        place = f"line {error.lineno} column {error.colno}"
+        said = what_else(data, _remedy(error.doc, error.pos))
+        raise ValueError(f"{path}: malformed JSON at {place}: {error.msg}; {said}") from None
     except RecursionError:
         raise ValueError(f"{path}: malformed JSON: nested too deeply") from None
     except ValueError as error:  # an integer of thousands of digits
         raise ValueError(f"{path}: malformed JSON: {error}") from None
+
+
+def _remedy(text: str, place: int) -> str:
+    """What to do about text that is no JSON from a place on."""
+    found = text[place:].lstrip()
+    if found.startswith(("//", "/*", "#")):
+        return "JSON has no comments: remove them"
+    # Python before 3.13 points at what follows the comma, later ones at the comma.
+    if found.lstrip(", \n\r\t").startswith(("]", "}")) and "," in text[:place].rstrip()[-1:] + found[:1]:
+        return "remove the comma before the bracket"
+    return "correct it there, or export it again"
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -82,7 +107,10 @@ def number(value: Any, where: str, low: float = -MAX_NUMBER, high: float = MAX_N
     """A number in [low, high]; ValueError naming where it stands otherwise."""
     # bool is an int to Python, not to JSON; and NaN fails the comparison.
     if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
-        raise ValueError(f"{where} must be a number in [{low:g}, {high:g}], got {short(value)}")
+        said = "; write it without quotes" if isinstance(value, str) else ""
+        if isinstance(value, float) and not math.isfinite(value):
+            said = "; export it again, or take the entry with it out"
+        raise ValueError(f"{where} must be a number in [{low:g}, {high:g}], got {short(value)}{said}")
     return float(value)
 
 

@@ -1,10 +1,9 @@
 """The keys of `transforms*.json`: which are used, which are harmless, and which change the meaning and are refused."""
 
 from collections.abc import Mapping
-from reprlib import repr as short
 from typing import Any
 
-from dnerf.data.formats.json_files import Notes
+from dnerf.data.formats.json_files import Notes, short
 
 MATRIX_KEYS = ("K", "intrinsic_matrix")
 TIME_KEYS = ("time", "timestamp", "frame_number", "frame_index", "frame_id", "frame")

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from reprlib import repr as short
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from torch import Tensor
 from dnerf.core.cameras import Intrinsics
 from dnerf.data.capture import CaptureFrame, ImageFile
 from dnerf.data.formats.folder import Folder
-from dnerf.data.formats.json_files import MAX_FRAMES, matrix, number, numbers, read_object, required, text
+from dnerf.data.formats.json_files import MAX_FRAMES, matrix, number, numbers, read_object, required, short, text
 from dnerf.data.formats.keys import TIME_KEYS, check_keys
 from dnerf.data.formats.manifest_cameras import LensFields
 from dnerf.data.formats.points import read_ply
@@ -60,9 +59,12 @@ class Manifest:
         there = [found is not None and found[1] for found in images]
         if not any(there):
             if not cameras_only:
+                first = next(found[0] for found in images if found)
+                other = self.folder.other_kind(first)
+                said = "put them there, or correct file_path"
                 raise ValueError(
-                    f"{self.path}: none of its {len(images)} images is there, the first is "
-                    f"{next(found[0] for found in images if found)}; put them there, or correct file_path"
+                    f"{self.path}: none of its {len(images)} images is there, the first is {first}; "
+                    + (said if other is None else f"there is {other.name}: convert them to PNG or JPEG")
                 )
             self.folder.notes.add(f"{self.path.name}: none of its {len(images)} images is there, only cameras are read")
         times = self._times()

@@ -3,12 +3,11 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from reprlib import repr as short
 from typing import Any
 
 from dnerf.core.cameras import PIXEL_OFFSETS, Intrinsics
 from dnerf.core.lenses import Distortion
-from dnerf.data.formats.json_files import matrix, number, whole
+from dnerf.data.formats.json_files import matrix, number, short, whole
 from dnerf.data.formats.keys import COEFFICIENTS, MATRIX_KEYS
 
 ANGLES = (1e-3, 3.14)
@@ -78,9 +77,16 @@ class LensFields:
                 "add the horizontal field of view in radians, or the focal length in pixels"
             )
         focal_x, focal_y, center_x, center_y = found
+        center_place = f"{place}K"
         if center_x is None or center_y is None:
             center_x = self.number("cx", -100 * width, 100 * width)
             center_y = self.number("cy", -100 * height, 100 * height)
+            center_place = self.find("cx")[1]
+        if 0 < (center_x or 0) <= 1 and 0 < (center_y or 0) <= 1 < min(width, height):
+            raise ValueError(
+                f"{center_place}: the principal point must be in pixels of images of {width} x {height}, got "
+                f"{center_x:g}, {center_y:g}; multiply it by their width and height if these are shares"
+            )
         if self.stated_size() is None and (center_x or 0) > 1.5 * width and (center_y or 0) > 1.5 * height:
             raise ValueError(
                 f"{self.find('cx')[1]} and cy lie at {center_x:g}, {center_y:g}, far outside of images of "

@@ -7,7 +7,6 @@ import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from reprlib import repr as short
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from dnerf.data.formats.json_files import (
     numbers,
     read_object,
     required,
+    short,
     whole,
 )
 from dnerf.data.formats.manifest import direction

@@ -2,12 +2,22 @@
 
 from dataclasses import replace
 from pathlib import Path
-from reprlib import repr as short
 from typing import Any
 
 from dnerf.data.capture import Capture, CaptureFrame, ImageFile
 from dnerf.data.formats.folder import Folder
-from dnerf.data.formats.json_files import MAX_FRAMES, Notes, matrix, number, numbers, read_object, required, text, whole
+from dnerf.data.formats.json_files import (
+    MAX_FRAMES,
+    Notes,
+    matrix,
+    number,
+    numbers,
+    read_object,
+    required,
+    short,
+    text,
+    whole,
+)
 from dnerf.data.formats.keys import LENS_KEYS
 from dnerf.data.formats.manifest import color, unique
 from dnerf.data.formats.manifest_cameras import MAX_SIDE, LensFields

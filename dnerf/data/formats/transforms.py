@@ -1,11 +1,10 @@
 """A single `transforms.json`, as nerfstudio, instant-ngp, BlenderNeRF and many capture apps write it."""
 
 from pathlib import Path
-from reprlib import repr as short
 
 from dnerf.data.capture import Capture, CaptureFrame
 from dnerf.data.formats.folder import Folder
-from dnerf.data.formats.json_files import Notes
+from dnerf.data.formats.json_files import Notes, short
 from dnerf.data.formats.manifest import Manifest, named_points
 
 SPLITS = ("train", "val", "test")

@@ -85,8 +85,9 @@ MATRIX = r"frames\[1\].transform_matrix"
         (top(frames={"a": 1}), r"frames must be a list"),
         (lambda m: m["frames"].insert(1, "x"), r"frames\[1\] must be an object, got 'x'"),
         (frame(time=...), r"frames\[1\].time is missing, other frames have it; give it to all, or to none"),
-        (frame(time=math.nan), r"frames\[1\].time must be a number .* got nan"),
-        (frame(time="0.5"), r"frames\[1\].time must be a number .* got '0.5'"),
+        (lambda m: m.update(frames=dict(enumerate(m["frames"]))), r"frames must be a list .{,165}\.\.\.$"),
+        (frame(time=math.nan), r"frames\[1\].time must be a number .* got nan; export it again, or take"),
+        (frame(time="0.5"), r"frames\[1\].time must be a number .* got '0.5'; write it without quotes"),
         (frame(time=True), r"frames\[1\].time must be a number .* got True"),
         (frame(time=10**400), r"frames\[1\].time must be a number .* got 1000"),
         (frame(transform_matrix=...), r"frames\[1\].transform_matrix is missing"),
@@ -143,7 +144,13 @@ def test_bad_fields_are_named_in_one_line(root: Path, edit: Edit, message: str) 
     ("content", "message"),
     [
         (b"", "malformed JSON at line 1 column 1"),
-        (b'{"frames": [\n  wrong]}', "malformed JSON at line 2 column 3"),
+        (b'{"frames": [\n  wrong]}', "malformed JSON at line 2 column 3: .*; correct it there, or export it again"),
+        (b'{"frames": [1, 2,\n ]}', "malformed JSON at line .*; remove the comma before the bracket"),
+        (b'{"frames": 1, }', "malformed JSON at line 1 .*; remove the comma before the bracket"),
+        (b'{"frames": }', "malformed JSON at line 1 .*; correct it there"),
+        (b"// mine\n{}", "malformed JSON at line 1 column 1: .*; JSON has no comments: remove them"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "it is a Git LFS pointer: git lfs pull fetches"),
+        ("{}".encode("utf-16"), "not UTF-8 at byte 0; it is UTF-16: save it as UTF-8"),
         (b"[1, 2]", r"must hold an object, got \[1, 2\]"),
         (b'{"frames": "\xff\xfe"}', "not UTF-8 at byte 12"),
         (b"[" * 100_000, "malformed JSON: nested too deeply"),
@@ -227,8 +234,12 @@ def test_a_dot_in_a_name_is_no_suffix_and_utf8_with_a_byte_order_mark_is_read(ro
 def test_images_of_another_kind_are_named_as_such(root: Path) -> None:
     (root / "train/0001.png").rename(root / "train/0001.webp")
     (root / "train/0001.webp").write_bytes(b"RIFF____WEBP")
-    with pytest.raises(ValueError, match=r"train/0001.webp: image must be a PNG or JPEG file"):
+    with pytest.raises(ValueError, match=r"train/0001.webp: image must be a PNG or JPEG file; it is WebP .*: convert"):
         read_capture(edited(root, frame(file_path="train/0001.webp")))
+    for path in (root / "train").glob("*.png"):
+        path.rename(path.with_suffix(".webp"))
+    with pytest.raises(ValueError, match=r"none of its 4 .*; there is 0000\.webp: convert them to PNG or JPEG"):
+        read_capture(edited(root, lambda m: [one.update(file_path=one["file_path"][:10]) for one in m["frames"]]))
 
 
 def test_images_that_were_reduced_are_found_in_their_folder(tmp_path: Path) -> None:
@@ -351,6 +362,8 @@ def test_a_frames_own_coefficients_come_before_the_files(root: Path) -> None:
         ({"fl_x": 0.3}, "fl_x must be in pixels of images 8 across, got 0.3; multiply it by 8 if it is a share"),
         ({"fl_x": -9}, "fl_x must be a number in .* got -9"),
         ({"fl_x": 9, "fl_y": 0}, "fl_y must be a number in .* got 0"),
+        ({"cx": 0.5, "cy": 0.5}, "cx: the principal point must be in pixels of images of 8 x 6, got 0.5, 0.5; multip"),
+        ({"K": [[9, 0, 0.5], [0, 9, 0.4], [0, 0, 1]]}, "K: the principal point must be in pixels .* got 0.5, 0.4"),
         ({"cx": math.nan}, "cx must be a number in .* got nan"),
         ({"cx": 32, "cy": 24}, "cx and cy lie at 32, 24, far outside of images of 8 x 6; add w and h"),
         ({"w": 8.5, "h": 6}, "w must be a whole number, got 8.5"),

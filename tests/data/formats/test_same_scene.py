@@ -91,8 +91,14 @@ def test_the_listing_file_may_be_named_instead_of_its_folder(tmp_path: Path) -> 
 
 def test_unknown_folders_say_what_was_looked_for_and_where_a_data_set_lies(tmp_path: Path) -> None:
     data_folders.write_llff(tmp_path / "scene")
+    for name, said in (("film.mp4", "COLMAP, or nerfstudio's"), ("scene.zip", "unpack it")):
+        (tmp_path / name).touch()
+        with pytest.raises(ValueError, match=rf"root must be a data set's folder, got the file .*{name}; .*{said}"):
+            read_capture(tmp_path / name)
     with pytest.raises(ValueError, match=r"no data set is recognised, none of transforms_train.json .*'scene' below"):
         read_capture(tmp_path)
+    with pytest.raises(ValueError, match="images and films alone do not say where cameras stood"):
+        read_capture(tmp_path / "scene/images")
     with pytest.raises(ValueError, match="format must be one of auto, blender"):
         read_capture(tmp_path / "scene", "nerf")
     with pytest.raises(ValueError, match=r"transforms_train.json: file does not exist"):
