@@ -49,10 +49,7 @@ def run(settings: Settings) -> SuiteResult:
             Table("Solvers", solvers),
         ],
         plots=[*(_plot(solvers, field) for field in fields), _costs_plot(costs)],
-        findings=[
-            *(_cheapest(solvers, field) for field in fields),
-            _slowest(costs),
-        ],
+        findings=[*(_cheapest(solvers, field) for field in fields), _slowest(costs)],
     )
 
 
@@ -66,10 +63,7 @@ def _order(rows: list[Row]) -> float | None:
 def _orders(rows: list[Row]) -> list[Row]:
     """Fitted order of every fixed-step solver on every field beside its theory."""
     return [
-        {
-            "field": field,
-            **{f"{s} (theory {order})": _order(_of(rows, field, s)) for s, order in FIXED_SOLVERS.items()},
-        }
+        {"field": field, **{f"{s} (theory {order})": _order(_of(rows, field, s)) for s, order in FIXED_SOLVERS.items()}}
         for field in dict.fromkeys(row["field"] for row in rows)
     ]
 

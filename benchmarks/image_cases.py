@@ -7,15 +7,7 @@ import torch
 
 from benchmarks.kernel_cases import STEP, Call, Case, Workload, backends
 from dnerf.core.cameras import Camera, Intrinsics, look_at
-from dnerf.kernels import (
-    FrameTables,
-    add_seen,
-    covered_places,
-    footprints,
-    seen_parts,
-    shade,
-    trace_network,
-)
+from dnerf.kernels import FrameTables, add_seen, covered_places, footprints, seen_parts, shade, trace_network
 
 DISPLACEMENTS = 80  # cells per side of the displacements' lattice
 

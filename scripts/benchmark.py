@@ -41,15 +41,10 @@ def _run(config: DictConfig, suite: str, folder: Path) -> None:
     section: Any = OmegaConf.to_container(config, resolve=True)
     device = resolve_device(config.device).type
     settings = Settings(
-        quick=config.quick,
-        seed=config.seed,
-        device=device,
-        work_dir=Path("runs/benchmark") / f"{suite}_work",
-        train_command=(sys.executable, str(Path(__file__).with_name("train.py"))),
-        build=_parts,
-        load=_finished,
+        quick=config.quick, seed=config.seed, device=device, work_dir=Path("runs/benchmark") / f"{suite}_work",
+        train_command=(sys.executable, str(Path(__file__).with_name("train.py"))), build=_parts, load=_finished,
         options={"data_root": config.data_root, **section.get(suite, {})},
-    )
+    )  # fmt: skip
     machine = describe_machine()
     begin = time.perf_counter()
     result = run_suite(suite, settings)

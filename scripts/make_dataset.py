@@ -6,24 +6,24 @@ from hydra_app import build, run_app
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from dnerf.data import SPLITS, SyntheticData, save_blender
+from dnerf.data import SPLITS, SyntheticData, film_by_phone, save_blender, save_transforms
+from dnerf.visualization import write_frames
 
 
 def main(config: DictConfig) -> None:
-    """Render the splits exactly and write the folder."""
+    """Render the splits exactly and write the folder; with `film` those of a phone's film, and the film itself."""
     out = Path(config.out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ValueError(f"out: {out} exists and is not an empty folder")
-    source = SyntheticData(
-        build(config.scene, trusted=True),
-        config.resolution,
-        num_train=config.num_frames,
-        num_val=config.num_val,
-        num_test=config.num_test,
-        seed=config.seed,
-    )
-    frames = {split: source.frames(split) for split in tqdm(SPLITS, unit="split")}
-    save_blender(frames, out)
+    scene, counts = build(config.scene, trusted=True), {"num_train": config.num_frames, "num_test": config.num_test}
+    if config.film is not None:
+        frames = film_by_phone(scene, config.resolution, **counts)
+        save_transforms(frames, out)
+        print(f"film: {write_frames(frames['train'].images, config.film, 'mp4', fps=config.fps)}")
+    else:
+        source = SyntheticData(scene, config.resolution, num_val=config.num_val, seed=config.seed, **counts)
+        frames = {split: source.frames(split) for split in tqdm(SPLITS, unit="split")}
+        save_blender(frames, out)
     print(f"{sum(len(f) for f in frames.values())} frames: {out}")
 
 

@@ -1,6 +1,5 @@
 """What training and evaluation both report: metrics.json, a contact sheet, a table."""
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ from dnerf.core.backgrounds import COLORS, ConstantBackground, parse_color
 from dnerf.core.files import write_json
 from dnerf.data import DataSource, Frames
 from dnerf.data.background_check import SAME_LEVELS
+from dnerf.data.formats.json_files import read_object
 from dnerf.evaluation import FrameScore, evaluate, scores_by_time, spread_indices
 from dnerf.evaluation.provenance import provenance
 from dnerf.rendering.renderer import Renderer
@@ -63,15 +63,10 @@ def evaluate_run(
     with on_background_of(frames, renderer):
         evaluation = evaluate(renderer, frames, split, chunk=chunk, max_frames=max_frames, on_frame=keep, lpips=lpips)
         background = _color_name(renderer)
-    metrics = {
-        **evaluation.as_dict(),
-        **training,
-        "frames_of_split": len(frames),
-        "resolution": frames.intrinsics[0].width,
-        "background": background,
-        **(settings or {}),
-        **provenance(),
-    }
+    facts = {
+        "frames_of_split": len(frames), "resolution": frames.intrinsics[0].width, "background": background
+    }  # fmt: skip
+    metrics = {**evaluation.as_dict(), **training, **facts, **(settings or {}), **provenance()}
     if data.train_end is not None:
         metrics |= {"train_end": data.train_end, **scores_by_time(evaluation.frames, data.train_end)}
     write_png(comparison_sheet(pairs, labels), sheet_path(folder, split))
@@ -120,11 +115,9 @@ def read_training(folder: Path) -> dict[str, object]:
     """
     path = folder / "training.json"
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: not a readable JSON file; did the training finish? ({error})") from error
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: expected a mapping, got {type(values).__name__}")
+        values = read_object(path)
+    except ValueError as error:
+        raise ValueError(f"{error}; did the training finish?") from error
     for name in ("train_seconds", "num_steps", "num_parameters"):
         if not isinstance(values.get(name), int | float):
             raise ValueError(f"{path}: {name} must be a number, got {values.get(name)!r}")

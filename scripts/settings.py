@@ -95,7 +95,13 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
         "split": SPLIT, "frame": COUNT, "start": NUMBER.or_null(), "spacing": POSITIVE, "every": POSITIVE,
         "trail": COUNT, "format": TEXT, "resolution": POSITIVE.or_null(), "chunk": POSITIVE.or_null(),
     },
-    "make_dataset": {"out": TEXT, "num_val": POSITIVE, "num_test": POSITIVE, "resolution": POSITIVE},
+    "make_dataset": {
+        "out": TEXT, "film": TEXT.or_null(), "num_val": POSITIVE, "num_test": POSITIVE, "resolution": POSITIVE,
+    },
+    "capture": {
+        "video": TEXT.or_null(), "images": TEXT.or_null(), "model": TEXT.or_null(), "masks": TEXT.or_null(),
+        "out_dir": TEXT, "width": POSITIVE, "min_share": NUMBER,
+    },
     "report": {"title": TEXT.or_null(), "films": TEXTS.or_null()},
 }  # fmt: skip
 

@@ -56,24 +56,38 @@ def render_frames(
     scene: AnalyticScene,
     poses: Tensor,
     times: Tensor,
-    resolution: int,
+    lens: int | Intrinsics,
     *,
     background: Sequence[float] | None = None,
+    gains: Tensor | None = None,
+    planes: tuple[float, float] = (2.0, 6.0),
+    oversampling: int = 1,
 ) -> Frames:
-    """Render exact square frames, one ray through each pixel's centre, with the field of view of D-NeRF's cameras.
+    """Render exact frames, one ray through each pixel's centre.
 
     Args:
         poses: (F, 4, 4) camera-to-world.
         times: (F,) in [0, 1].
+        lens: of all frames; or the width of square ones with the field of view of D-NeRF's cameras.
         background: colour behind the frames, which then have no alpha; None keeps premultiplied alpha.
+        gains: (F, 3) factors of the colours, as of an exposure that drifts; None for 1.
+        planes: z-depths near and far.
+        oversampling: pixels are averages of this squared.
     """
-    check_positive("resolution", resolution)
-    intrinsics = Intrinsics.from_angle(resolution, resolution, DNERF_ANGLE_X)
+    check_positive("oversampling", oversampling)
+    if isinstance(lens, int):
+        check_positive("resolution", lens)
+        lens = Intrinsics.from_angle(lens, lens, DNERF_ANGLE_X)
     color = None if background is None else torch.tensor(background)
-    channels = 4 if color is None else 3
-    images = torch.empty(len(times), resolution, resolution, channels, dtype=torch.uint8)
+    channels, n = 4 if color is None else 3, oversampling
+    fine = lens.resized(n * lens.width, n * lens.height)
+    images = torch.empty(len(times), lens.height, lens.width, channels, dtype=torch.uint8)
     for i, (pose, time) in enumerate(zip(poses, times.tolist())):
-        rgb, opacity, _ = render_exact(scene, Camera(intrinsics, pose).rays(time), color)
+        rgb, opacity, _ = render_exact(scene, Camera(fine, pose, *planes).rays(time), color)
+        if gains is not None:
+            rgb = rgb * gains[i]
         pixels = rgb if color is not None else torch.cat([rgb, opacity[:, None]], dim=-1)
-        images[i] = (pixels.clamp(0, 1) * 255).round().to(torch.uint8).reshape(images[i].shape)
-    return Frames(images, poses, times, intrinsics, background=None if background is None else tuple(background))
+        pixels = pixels.clamp(0, 1).reshape(lens.height, n, lens.width, n, channels).mean((1, 3))
+        images[i] = (pixels * 255).round().to(torch.uint8)
+    stated = None if background is None or gains is not None else tuple(background)
+    return Frames(images, poses, times, lens, *planes, background=stated)

