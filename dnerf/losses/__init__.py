@@ -1,11 +1,11 @@
 """Training losses: each looks at a rendering, its batch and the model, and returns one number."""
 
 from dnerf.losses.base import Batch, Loss
-from dnerf.losses.deformation import AppearanceConstancyLoss, ElasticLoss, JacobianDeterminantLoss, VolumeLoss
+from dnerf.losses.deformation import AppearanceConstancyLoss, ElasticLoss, JacobianDeterminantLoss, RestLoss, VolumeLoss
 from dnerf.losses.photometric import PhotometricLoss
 from dnerf.losses.regularizers import SpaceTimeSmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 
 __all__ = [
     "AppearanceConstancyLoss", "Batch", "ElasticLoss", "JacobianDeterminantLoss", "Loss",
-    "PhotometricLoss", "SpaceTimeSmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss", "VolumeLoss",
+    "PhotometricLoss", "RestLoss", "SpaceTimeSmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss", "VolumeLoss",
 ]  # fmt: skip

@@ -21,6 +21,7 @@ from dnerf.losses.base import Batch, Loss
 from dnerf.rendering.renderer import Renderer
 
 LEAST_STRETCH = 0.01
+LEAST_DISTANCE = 1e-4  # world units, below which a displacement counts as none and has no gradient
 GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
@@ -124,6 +125,29 @@ class ElasticLoss(DeformationLoss):
         here, there = unwrapped(field.deformation)(ends, points.times.repeat(2)).chunk(2)
         squared = ((there - here) / self.distance).square().sum(-1)
         return saturated((0.5 * torch.log(squared + LEAST_STRETCH**2)).square(), self.saturation)
+
+
+class RestLoss(DeformationLoss):
+    """How far things move: `|D(x, t) - x|`, at the times of other rays as well as at a sample's own.
+
+    Where several cameras look at several times, nothing says how a place looked at the times when none saw it. With
+    this it looked as it did when it was seen, unless images say otherwise.
+
+    Source: the price of the flow in Neural Scene Flow Fields (arXiv 2011.13084); deviation: other times.
+
+    Args:
+        weight, num_points, every: see `DeformationLoss`.
+    """
+
+    def __init__(self, weight: float | Schedule = 1e-2, num_points: int = 512, *, every: int = 2) -> None:
+        super().__init__(weight, num_points, every=every)
+
+    def _penalty(self, field: DeformedField, points: MotionPoints) -> Tensor:
+        """Distances, half of them at the times of points half a batch away."""
+        other = points.times.roll(len(points.times) // 2)
+        is_own = torch.arange(len(other), device=other.device) % 2 == 0
+        moved = unwrapped(field.deformation)(points.positions, torch.where(is_own, points.times, other))
+        return (moved - points.positions).square().sum(-1).clamp(min=LEAST_DISTANCE**2).sqrt()
 
 
 class VolumeLoss(DeformationLoss):

@@ -36,7 +36,7 @@ def test_what_the_file_states_comes_before_the_borders_and_is_compared_as_it_com
     assert background_contradiction(WHITE, stated) is None
     with pytest.raises(ValueError, match=r"background must be \[1.0, 1.0, 1.0\] as the data set states"):
         background_contradiction(BLACK, stated)
-    grey = ConstantBackground((0.2, 0.4, 0.6))(torch.zeros(1, 3))[0]
+    grey = ConstantBackground((0.2, 0.4, 0.6))(frames(0).camera(0).rays(0.0))[0]
     assert background_contradiction(grey, frames(0, background=(0.2, 0.4, 0.6))) is None
 
 

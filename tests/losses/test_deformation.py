@@ -1,6 +1,7 @@
 """Losses about motion against the closed forms of simple flows."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from dnerf.deformations import AlongRaysDeformation, Deformation, DisplacementDe
 from dnerf.deformations.jacobian import folding
 from dnerf.deformations.velocities import NetworkVelocity, Velocity
 from dnerf.fields import DeformedField, GridField, RadianceField
-from dnerf.losses import AppearanceConstancyLoss, Batch, ElasticLoss, JacobianDeterminantLoss, VolumeLoss
+from dnerf.losses import AppearanceConstancyLoss, Batch, ElasticLoss, JacobianDeterminantLoss, RestLoss, VolumeLoss
 from dnerf.losses.deformation import spread_directions
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
@@ -22,7 +23,7 @@ from dnerf.scenes import make_scene
 
 LOSSES = {
     "elastic": ElasticLoss, "volume": VolumeLoss, "jacobian": JacobianDeterminantLoss,
-    "appearance": AppearanceConstancyLoss,
+    "appearance": AppearanceConstancyLoss, "rest": RestLoss,
 }  # fmt: skip
 BATCH = Batch(torch.zeros(8, 4), torch.zeros(8, 3))
 every_loss = pytest.mark.parametrize("name", LOSSES)
@@ -99,6 +100,34 @@ def test_gradient_is_finite_where_all_is_collapsed() -> None:
     renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
     ElasticLoss(1.0)(rendering(dtype=torch.float32), BATCH, renderer).backward()
     assert torch.isfinite(deformation.matrix.grad).all()
+
+
+class Shift(Deformation):
+    """x -> x + v t."""
+
+    def __init__(self, velocity: tuple[float, float, float]) -> None:
+        super().__init__()
+        self.velocity = torch.nn.Parameter(torch.tensor(velocity, dtype=torch.float64))
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        return positions + self.velocity * times[..., None]
+
+
+def test_rest_costs_distances_at_the_times_of_half_a_batch_away_too() -> None:
+    shown = replace(rendering(), weights=torch.ones(64))
+    renderer = Renderer(DeformedField(Shift((0.3, 0.0, 0.4)), make_scene("static")), StratifiedSampler(4))
+    times = shown.output.extras["times"]
+    expected = 0.5 * sum(float(times[i if i % 2 == 0 else (i + 32) % 64]) for i in range(64)) / 64
+    assert RestLoss(1.0)(shown, BATCH, renderer).item() == pytest.approx(expected)
+
+
+def test_what_rests_has_no_gradient_and_costs_nothing() -> None:
+    deformation = Shift((0.0, 0.0, 0.0))
+    renderer = Renderer(DeformedField(deformation, make_scene("static")), StratifiedSampler(4))
+    loss = RestLoss(1.0)(rendering(), BATCH, renderer)
+    loss.backward()
+    assert loss.item() == pytest.approx(0, abs=2e-4)
+    assert deformation.velocity.grad.abs().max() == 0
 
 
 def test_what_keeps_volumes_costs_nothing() -> None:

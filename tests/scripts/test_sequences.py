@@ -419,7 +419,7 @@ def test_an_image_that_no_memory_holds_is_an_error_in_one_line(work):
     ("script", "name", "content", "named"),
     [
         ("evaluate", "training.json", "{}", "training.json: train_seconds must be a number, got None"),
-        ("evaluate", "training.json", "[1]", "training.json: expected a mapping, got list"),
+        ("evaluate", "training.json", "[1]", "training.json: must hold an object, got \\[1\\]"),
         ("report", "temporal.json", '{"motion": 1}', "temporal.json: expected the scores of evaluate.py"),
     ],
 )
