@@ -114,12 +114,13 @@ class _Planner:
             self.decisions[name] = self._untried(name, "the budget is too small to try")
             return
         others = [choice for choice in part.candidates if choice != standing]
+        simpler = others[: list(part.candidates).index(standing)]
         leading.choice = standing
         contenders = [leading]
         for choice in others:
             contenders.append(leading.forked(choice, self.make, self._choices(**{name: choice}), learnt, self.seed))
         before, first = [contender.run.seconds for contender in contenders], leading.run.step
-        result = contest(contenders, HeldOut.of(held, self.seed), effort)
+        result = contest(contenders, HeldOut.of(held, self.seed), effort, simpler)
         winner, better, error = result.winner, result.gain, result.error
         spent = (c.run.seconds - b for c, b in zip(contenders, before, strict=True) if c is not winner)
         lost = result.seconds + sum(spent)

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -23,7 +23,7 @@ LEAST_FRAMES = 8  # of the training split, below which none is held out
 NUM_RAYS = 8192  # of a comparison
 SPAN = 0.05  # of all steps done, over which weights are averaged for a comparison: steps of one size are noisy
 AVERAGE = "average"  # callback
-STANDARD_ERRORS = 2.0  # by which a candidate must be better than the one that stands
+STANDARD_ERRORS = 2.0  # by which a richer candidate must be better than the one that stands
 
 
 @dataclass(frozen=True)
@@ -170,15 +170,17 @@ class Result:
     seconds: float  # that comparisons took
 
 
-def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> Result:
+def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simpler: Collection[str] = ()) -> Result:
     """Train all, halving the number of challengers until one is left.
 
-    The first contender is the one that stands: another one wins only if it is better by two standard errors.
+    The first contender is the one that stands. A simpler one wins if it is better, a richer one only if it is better by
+    two standard errors.
 
     Args:
         contenders: at least two, the default first.
         held: what they are compared on.
         effort: of each until the last comparison, in as many rounds as there are halvings.
+        simpler: choices that are simpler than the default.
     """
     left, seconds = list(contenders), 0.0
     for contender in contenders:
@@ -203,7 +205,7 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> R
     best = min(left, key=lambda c: float(c.errors.mean()))
     if best is not standing:
         mean, error = gain(best.errors, standing.errors)
-        if mean > STANDARD_ERRORS * error:
+        if mean > (0 if best.choice in simpler and math.isfinite(error) else STANDARD_ERRORS * error):
             return Result(best, mean, error, seconds)
         return Result(standing, -mean, error, seconds)
     second = min((c for c in left if c is not standing), key=lambda c: float(c.errors.mean()))

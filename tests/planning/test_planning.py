@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -111,6 +112,31 @@ def test_contest_finds_the_candidate_that_learns_and_keeps_the_standing_one_of_e
     assert result.winner.choice == "quick"
     assert result.gain > 2 * result.error > 0
     assert contest(contenders("slow", "slow"), pixels, Effort(10, 0.0)).winner.choice == "slow"
+
+
+def test_a_simpler_candidate_wins_by_being_better_a_richer_one_by_two_standard_errors() -> None:
+    class Known:
+        """A contender whose errors are given."""
+
+        def __init__(self, choice: str, *errors: float) -> None:
+            self.choice, self.errors = choice, torch.tensor(errors, dtype=torch.float64)
+            self.run = self.trainer = MagicMock()
+
+        def begin(self) -> None: ...
+        def end(self) -> None: ...
+        def advance(self, effort: Effort) -> None: ...
+        def compare(self, held: HeldOut) -> None: ...
+
+    held = MagicMock()
+    held.within.return_value = held
+    standing, other = Known("default", 1.0, 2.0, 1.0), Known("other", 1.1, 1.5, 1.0)
+    mean, error = gain(other.errors, standing.errors)
+    assert 0 < mean < 2 * error
+    both = [standing, other]
+    assert contest(both, held, Effort(1, 0.0)).winner is standing  # type: ignore[arg-type]
+    assert contest(both, held, Effort(1, 0.0), ["other"]).winner is other  # type: ignore[arg-type]
+    one = [Known("default", 2.0), Known("other", 1.0)]
+    assert contest(one, held, Effort(1, 0.0), ["other"]).winner is one[0]  # type: ignore[arg-type]
 
 
 def part(**changes: object) -> Part:
