@@ -17,8 +17,7 @@ def main(config: DictConfig) -> None:
         Path(config.out_dir), find_films(video, images), StructureSettings(config.lens, config.matching, masks),
         model=model, num_frames=config.num_frames, width=config.width, min_share=config.min_share,
     )  # fmt: skip
-    print(*report, sep="\n")
-    print(f"look at it: python scripts/check_data.py data.root={config.out_dir}")
+    print(*report, f"look at it: python scripts/check_data.py data.root={config.out_dir}", sep="\n")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from dnerf.data import SPLITS, SyntheticData, film_by_phone, save_blender, save_transforms
-from dnerf.visualization import write_frames
+from dnerf.visualization.video import check_film, write_frames
 
 
 def main(config: DictConfig) -> None:
@@ -17,9 +17,10 @@ def main(config: DictConfig) -> None:
         raise ValueError(f"out: {out} exists and is not an empty folder")
     scene, counts = build(config.scene, trusted=True), {"num_train": config.num_frames, "num_test": config.num_test}
     if config.film is not None:
+        check_film(Path(config.film), "mp4")
         frames = film_by_phone(scene, config.resolution, **counts)
         save_transforms(frames, out)
-        print(f"film: {write_frames(frames['train'].images, config.film, 'mp4', fps=config.fps)}")
+        print("film:", write_frames(frames["train"].images, config.film, "mp4", fps=config.fps))
     else:
         source = SyntheticData(scene, config.resolution, num_val=config.num_val, seed=config.seed, **counts)
         frames = {split: source.frames(split) for split in tqdm(SPLITS, unit="split")}

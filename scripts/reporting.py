@@ -94,12 +94,13 @@ def on_background_of(frames: Frames, renderer: Renderer) -> Iterator[None]:
 
 def _differs(renderer: Renderer, color: tuple[float, float, float]) -> bool:
     constant = renderer.background.constant()
-    return constant is None or float((constant.cpu() - torch.tensor(color)).abs().max()) > SAME_LEVELS / 255
+    return constant is not None and float((constant.cpu() - torch.tensor(color)).abs().max()) > SAME_LEVELS / 255
 
 
 def _color_name(renderer: Renderer) -> str:
-    color = tuple(renderer.plain_background().tolist())
-    return next((name for name, known in COLORS.items() if known == color), str(color))
+    constant = renderer.background.constant()
+    color = () if constant is None else tuple(constant.tolist())
+    return next((name for name, known in COLORS.items() if known == color), str(color) if color else "learnt")
 
 
 def sheet_path(folder: Path, split: str) -> Path:

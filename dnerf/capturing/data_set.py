@@ -25,7 +25,7 @@ from dnerf.data.formats.writers import transforms_fields
 
 GOOD_SHARE, GOOD_ERROR = 0.95, 1.5  # of frames placed, and mean pixels off: below and above, the report warns
 LEAST_FRAMES = 3
-POINTS = "points.ply"
+POINTS, MANIFEST = "points.ply", "transforms.json"
 
 
 def capture(
@@ -54,6 +54,8 @@ def capture(
         ValueError: in one line that says what is wrong, and what to do or to film instead.
     """
     check_whole("num_frames", num_frames)
+    if num_frames < LEAST_FRAMES:
+        raise ValueError(f"num_frames must be at least {LEAST_FRAMES}, got {num_frames}")
     check_whole("width", width)
     if not 0 <= min_share <= 1:
         raise ValueError(f"min_share must be in [0, 1], got {min_share}")
@@ -61,11 +63,13 @@ def capture(
         raise ValueError("model needs images=folder, that of the images it was made of")
     load_pycolmap()
     files = [_stamps(film.images or (film.path,)) for film in films]
+    given = None if model is None else _stamps(path for path in model.rglob("*") if path.is_file())
     stages = _Stages(out_dir, {"num_frames": num_frames, "width": width, "files": files})
     images, work, is_ordered = out_dir / "images", out_dir / "structure", all(film.is_ordered for film in films)
     count = num_frames if is_ordered and model is None else None
     with claimed(out_dir):
-        remove_leftovers(out_dir)
+        for folder in (out_dir, images, *images.glob("*/")):
+            remove_leftovers(folder)
         chosen = stages.result("frames", None, lambda: [vars(f) for f in choose_frames(films, images, count, width)])
         frames = [ChosenFrame(**(fields | {"size": tuple(fields["size"])})) for fields in chosen]
         if len(frames) < LEAST_FRAMES:
@@ -75,12 +79,13 @@ def capture(
         stages.result("features", of_features, lambda: shutil.rmtree(work, ignore_errors=True))
 
         def find() -> dict[str, Any]:
+            (out_dir / MANIFEST).unlink(missing_ok=True)  # it goes with the points that were
             if model is not None:
                 return _keep([_given_model(model, frames)], len(frames), 0.0, out_dir)
             models = find_structure(frames, images, work, settings, is_ordered=is_ordered)
             return _keep(models, len(frames), min_share, out_dir)
 
-        found = stages.result("structure", [of_features, settings.matching, str(model)], find)
+        found = stages.result("structure", [of_features, settings.matching, min_share, given], find)
         cameras = colmap.read(out_dir).splits["all"]
         _write_manifest(cameras, frames, out_dir)
     return _report(found, cameras, out_dir)
@@ -154,19 +159,21 @@ def _write_manifest(cameras: Sequence[CaptureFrame], frames: Sequence[ChosenFram
         name, time = times[camera.name]
         listed.append({"file_path": f"images/{name}", "time": time, "transform_matrix": camera.pose})
     fields = transforms_fields(listed, [camera.intrinsics for camera in cameras], {"ply_file_path": POINTS})
-    write_json(out_dir / "transforms.json", fields)
+    write_json(out_dir / MANIFEST, fields)
 
 
 def _report(found: dict[str, Any], cameras: Sequence[CaptureFrame], folder: Path) -> list[str]:
     """How good it is, in lines."""
     placed, total, error = found["parts"][0], found["frames"], found["error"]
     lens = cameras[0].intrinsics
-    degrees = 2 * math.degrees(math.atan(0.5 * lens.width / lens.focal_x))
+    ratio = max(lens.width / lens.focal_x, lens.height / lens.focal_y)
+    is_fisheye = lens.distortion is not None and lens.distortion.model == "fisheye"
+    degrees = math.degrees(ratio if is_fisheye else 2 * math.atan(0.5 * ratio))
     lines = [
         f"frames placed: {placed} of {total} ({placed / total:.0%})",
         f"reprojection error: {error:.2f} pixels in images of {lens.width} x {lens.height}",
         f"points: {found['points']}, of which each is seen in {GOOD_TRACK} frames or more",
-        f"lens: focal length {lens.focal_x:.0f} pixels, {degrees:.0f} degrees wide",
+        f"lens: focal length {lens.focal_x:.0f} pixels, {degrees:.0f} degrees across the longer side",
         f"data set: {folder}",
     ]
     if placed < GOOD_SHARE * total:

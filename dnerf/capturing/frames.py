@@ -74,7 +74,7 @@ def find_films(video: Path | None = None, images: Path | None = None) -> list[Fi
         raise ValueError(f"video: {video} does not exist; give a video file, or a folder of one for each camera")
     files = [video]
     if video.is_dir():
-        files = sorted(file for file in video.iterdir() if file.name.endswith(VIDEO_SUFFIXES))
+        files = sorted(file for file in video.iterdir() if _is_seen(file, VIDEO_SUFFIXES))
         if not files or len({file.stem for file in files}) < len(files):
             raise ValueError(f"video: {video} must hold videos of different names; if it holds images, images={video}")
     for file in files:
@@ -83,8 +83,13 @@ def find_films(video: Path | None = None, images: Path | None = None) -> list[Fi
     return [Film(file.stem if video.is_dir() else "", file) for file in files]
 
 
+def _is_seen(path: Path, suffixes: tuple[str, ...]) -> bool:
+    """Whether a file's name has one of the suffixes, and is not hidden: those are of programs."""
+    return path.name.endswith(suffixes) and not path.name.startswith(".")
+
+
 def _film_of_images(folder: Path) -> Film:
-    paths = sorted(path for path in folder.rglob("*") if path.name.endswith(IMAGE_SUFFIXES) and path.is_file())
+    paths = sorted(path for path in folder.rglob("*") if _is_seen(path, IMAGE_SUFFIXES) and path.is_file())
     names = [path.relative_to(folder).with_suffix("").as_posix() for path in paths]
     if len(paths) < 2 or len(set(names)) < len(paths):
         raise ValueError(f"images: {folder} must hold PNG or JPEG images of different names, got {len(paths)}")
@@ -124,7 +129,7 @@ def _choose(film: Film, number: int, folder: Path, num_frames: int | None, width
         found = sharpness(small)
         if best is None or found > best[0]:
             best = (found, index, small)
-        if (index + 1) * count // len(times) > index * count // len(times) or index + 1 == len(times):
+        if (index + 1) * count // len(times) > index * count // len(times):
             _, place, image = best
             name = film.label(place)
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

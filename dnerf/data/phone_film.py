@@ -1,6 +1,7 @@
 """A film as a phone in a hand makes it, of an exact scene: slow and jerky, through a lens, with drifting exposure."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -29,9 +30,7 @@ TINT = Wave(0.0, ((0.06, 0.9, 0.3),))  # red gains what blue loses, in stops
 def phone_lens(width: int) -> Intrinsics:
     """A wide lens with barrel distortion, 16 : 9."""
     lens = Intrinsics.from_angle(width, round(width * 9 / 16), ANGLE_X)
-    return Intrinsics(
-        lens.width, lens.height, lens.focal_x, lens.focal_y, distortion=Distortion("opencv", (-0.08, 0.03))
-    )
+    return replace(lens, distortion=Distortion("opencv", (-0.08, 0.03)))
 
 
 def phone_poses(times: Tensor) -> Tensor:
@@ -65,7 +64,7 @@ def film_by_phone(scene: AnalyticScene, width: int, *, num_train: int, num_test:
     times = (torch.arange(num_test) + 0.5) / num_test
     angles = (-0.5 * math.pi + 0.6 * torch.cos(2 * math.pi * times)).tolist()
     poses = [look_at((0.37 * math.cos(a), 0.37 * math.sin(a), 0.03), (0.0, 0.0, -0.07)) for a in angles]
-    lens = Intrinsics.from_angle(width, round(width * 9 / 16), ANGLE_X)
+    lens = replace(phone_lens(width), distortion=None)
     test = render_frames(
         scene, torch.stack(poses), times, lens, background=SKY, gains=torch.ones(num_test, 3), planes=PLANES,
         oversampling=2,

@@ -50,7 +50,7 @@ def read_frame_times(path: Path) -> list[float]:
     _facts(path.resolve(), _stamp(path))  # what is broken or too large is said in one way
     command = [imageio_ffmpeg.get_ffmpeg_exe(), *INPUT, "-i", f"file:{path.resolve()}", *OUTPUT]
     run = subprocess.run([*command, "-vf", "showinfo=checksum=0", "-f", "null", "-"], capture_output=True, check=False)
-    times = [float(time) for time in re.findall(rb" pts_time:(-?[0-9.]+)", run.stderr)]
+    times = [float(time) for time in re.findall(rb" pts_time:(-?[0-9.]+(?:e[-+]?[0-9]+)?)", run.stderr)]
     if not times:
         last = _last_line(run.stderr.decode(errors="replace"))
         raise ValueError(f"{path}: video states no times of its frames: {last}")

@@ -23,7 +23,7 @@ class Surroundings(Background):
     `leave + scale u / (1 - u)` for even u, with half of the box's longest side as the scale. The last interval is
     opaque: what is infinitely far has a colour of its own. Rays that miss the box begin at their near plane.
 
-    The density of the field is per unit of contracted space. It is divided by the square of the distance in units of
+    The density of the field is per half of the box's longest side, divided by the square of the distance in units of
     the box, by which the contraction shortens lengths along a ray.
 
     Source: NeRF++ (arXiv 2010.07492) section 4 for the split, mip-NeRF 360 (arXiv 2111.12077) section 3 for the

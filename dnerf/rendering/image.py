@@ -43,6 +43,7 @@ def image_columns(
     numbers, rays, grid = None, None, None
     if _is_plain(renderer) and isinstance(sampler, OccupancyAware) and speaks_for(sampler, "march_grid", "forward"):
         grid = sampler.march_grid(time, camera.pose.dtype)
+        # What lies beyond the box is behind all pixels.
         visible = None if renderer.background.is_costly else sampler.visible_rays(camera, time)
         if visible is not None:
             numbers, rays = visible

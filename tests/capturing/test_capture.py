@@ -178,7 +178,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, film: Path, pl
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"num_frames": 2}, "needs 3 frames or more, got 2; film longer"),
+        ({"num_frames": 2}, "num_frames must be at least 3, got 2"),
         ({"num_frames": 0}, "num_frames must be"),
         ({"min_share": 2}, r"min_share must be in \[0, 1\]"),
         ({"model": Path("sparse")}, "model needs images=folder"),

@@ -89,6 +89,14 @@ def test_images_are_ordered_and_timed_by_their_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / "img_9.png")), noise(9))
 
 
+def test_hidden_files_are_no_images(tmp_path: Path) -> None:
+    for number in (1, 2):
+        save(tmp_path / f"all/{number}.png", noise(number))
+    (tmp_path / "all/._1.jpg").write_bytes(b"of a Mac")
+    found = names_and_times(tmp_path / "out", images=tmp_path / "all")
+    assert len(found) == 2
+
+
 def test_images_without_numbers_are_in_no_order(tmp_path: Path) -> None:
     for name in ("tree", "door", "house"):
         save(tmp_path / "photos" / f"{name}.jpg", noise(1))

@@ -61,7 +61,7 @@ def test_even_density_up_to_a_distance_lets_through_what_its_integral_says(densi
 def test_nothing_gets_through_to_behind_infinity() -> None:
     color = surroundings(0.0).eval()(OUTWARDS)
     torch.testing.assert_close(color, torch.tensor([0.0, 0, 1]).double().expand(3, 3))
-    assert not surroundings(0.0).constant()
+    assert surroundings(0.0).constant() is None
 
 
 def test_rays_that_miss_the_box_begin_at_their_near_plane() -> None:
@@ -80,7 +80,7 @@ def test_training_draws_other_intervals_and_gradients_reach_the_field() -> None:
     assert model.field.strength.grad > 0  # type: ignore[operator]
 
 
-def test_images_see_them_through_what_is_inside_and_opaque_rays_do_not_ask() -> None:
+def test_images_see_them_through_what_is_inside_and_opaque_rays_leave_them_out() -> None:
     inside = Shells(2.0, 0.5)
     renderer = Renderer(inside, StratifiedSampler(64), surroundings(0.0)).double().eval()
     through = rays([[0, 0, 3], [0, 0.9, 3]], [[0, 0, -1], [0, 0, -1]])

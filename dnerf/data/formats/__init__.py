@@ -14,9 +14,7 @@ AXES = ("auto", "opengl", "opencv")
 MAX_SUBFOLDERS = 200
 LISTING_SUFFIXES = (".json", ".npy", ".bin", ".txt")
 PACKED = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
-
-
-POSES = "images and films alone do not say where cameras stood: COLMAP, or nerfstudio's ns-process-data, finds out"
+POSES = "images and films alone do not say where cameras stood: scripts/capture.py, or ns-process-data, finds out"
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,9 @@ class Folder:
 
     def other_kind(self, path: Path) -> Path | None:
         """A file of a missing image's name with another suffix, if there is one beside it."""
-        return next((found for suffix in OTHER_SUFFIXES if (found := Path(f"{path}{suffix}")).is_file()), None)
+        base = path.with_suffix("") if path.suffix in IMAGE_SUFFIXES else path
+        suffixes = (*OTHER_SUFFIXES, *(suffix.upper() for suffix in OTHER_SUFFIXES))
+        return next((found for suffix in suffixes if (found := Path(f"{base}{suffix}")).is_file()), None)
 
     def name(self, path: Path) -> str:
         """A file's name for messages: relative to the folder, without its suffix."""

@@ -9,15 +9,9 @@ from dnerf.scenes.motions import Fixed, Joint, Orbit, Slide, Spin, Wave
 from dnerf.scenes.shapes import Ball, Box, Capsule, Shape, Vector
 from dnerf.scenes.textures import Checker, Lit, Plain, Plane, sector_planes
 
-GROUND = -0.16
-"""Height of the ground: a camera that is held at the origin's height is some 1.3 metres up, if a unit is 8 metres."""
-
-THIN = 0.02
-"""Half the thickness of walls and of the ground."""
-
-DENSITY = 4000.0
-"""In 1 / world unit: light is gone within a pixel's width of the surface."""
-
+GROUND = -0.16  # its height: a camera at the origin's height is some 1.3 metres up, if a unit is 8 metres
+THIN = 0.02  # half the thickness of walls and of the ground
+DENSITY = 4000.0  # in 1 / world unit: light is gone within a pixel's width of the surface
 SUN = (-0.4, -0.5, 0.77)
 STONES = ((0.72, 0.68, 0.6), SLATE, (0.5, 0.46, 0.42), CREAM)
 PAINTS = ((CREAM, INDIGO, AMBER, SLATE), (SKY, PLUM, CREAM, TEAL), (CORAL, CREAM, SLATE, LEAF))
@@ -31,7 +25,7 @@ PILLARS: tuple[tuple[float, float], ...] = ((-0.42, 0.38), (0.1, 0.62), (0.5, 0.
 def make_courtyard() -> AnalyticScene:
     """A beach ball that goes round a turning, nodding post in the middle of a courtyard; t = 1 is t = 0 again.
 
-    The walls are five times as far away as the middle is from a camera at 0.35 from it. One side, -y, is open.
+    The walls are three to four times as far away as the middle is from a camera at 0.35 from it. One side, -y, is open.
     """
     bodies = [_still(Box((1.2, 1.2, THIN)), (0.0, 0.0, GROUND - THIN), STONES, 28)]
     for (x, y, half), paints in zip(WALLS, PAINTS):

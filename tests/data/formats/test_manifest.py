@@ -231,6 +231,13 @@ def test_a_dot_in_a_name_is_no_suffix_and_utf8_with_a_byte_order_mark_is_read(ro
         path.write_text(path.read_bytes()[3:].decode().replace(name, "0001.png"))
 
 
+def test_a_missing_image_that_is_there_in_another_kind_is_pointed_out(root: Path) -> None:
+    for path in [*(root / "train").glob("*.png")]:
+        path.rename(path.with_suffix(".HEIC"))
+    with pytest.raises(ValueError, match=r"there is \w+\.HEIC: convert them"):
+        read_capture(edited(root, frame(file_path="train/0001.png")))
+
+
 def test_images_of_another_kind_are_named_as_such(root: Path) -> None:
     (root / "train/0001.png").rename(root / "train/0001.webp")
     (root / "train/0001.webp").write_bytes(b"RIFF____WEBP")

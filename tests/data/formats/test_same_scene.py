@@ -91,7 +91,7 @@ def test_the_listing_file_may_be_named_instead_of_its_folder(tmp_path: Path) -> 
 
 def test_unknown_folders_say_what_was_looked_for_and_where_a_data_set_lies(tmp_path: Path) -> None:
     data_folders.write_llff(tmp_path / "scene")
-    for name, said in (("film.mp4", "COLMAP, or nerfstudio's"), ("scene.zip", "unpack it")):
+    for name, said in (("film.mp4", "scripts/capture.py"), ("scene.zip", "unpack it")):
         (tmp_path / name).touch()
         with pytest.raises(ValueError, match=rf"root must be a data set's folder, got the file .*{name}; .*{said}"):
             read_capture(tmp_path / name)
