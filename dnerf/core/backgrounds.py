@@ -28,7 +28,7 @@ class Background(nn.Module, ABC):
     """Colour behind each ray."""
 
     needs_alpha = False  # whether training needs images with alpha
-    is_costly = False  # whether to leave out rays through which no light gets
+    shows_beyond = False  # whether it is a scene beyond the box: costly, and left out where no light gets through
 
     @abstractmethod
     def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Tensor:

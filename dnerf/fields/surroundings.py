@@ -38,7 +38,7 @@ class Surroundings(Background):
         ValueError: for fewer than two intervals.
     """
 
-    is_costly = True
+    shows_beyond = True
 
     def __init__(self, box: Sequence[Sequence[float]], field: RadianceField, num_intervals: int = 24) -> None:
         super().__init__()

@@ -44,7 +44,7 @@ def image_columns(
     if _is_plain(renderer) and isinstance(sampler, OccupancyAware) and speaks_for(sampler, "march_grid", "forward"):
         grid = sampler.march_grid(time, camera.pose.dtype)
         # What lies beyond the box is behind all pixels.
-        visible = None if renderer.background.is_costly else sampler.visible_rays(camera, time)
+        visible = None if renderer.background.shows_beyond else sampler.visible_rays(camera, time)
         if visible is not None:
             numbers, rays = visible
     rays = camera.rays(time) if rays is None else rays

@@ -120,7 +120,7 @@ class Renderer(nn.Module):
     def behind(self, rays: Rays, opacity: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Colours (R, 3) behind rays of such opacity (R,); black where a costly background could not be seen."""
         with self.autocast(rays.origins.device):
-            if not self.background.is_costly or opacity.is_cuda:  # counting rays would make the CPU wait for the GPU
+            if not self.background.shows_beyond or opacity.is_cuda:  # counting rays would make the CPU wait for the GPU
                 return self.background(rays, generator=generator)
             seen = (opacity.detach() < 1 - LEAST_LIGHT).nonzero()[:, 0]
             colors = self.background(rays[seen], generator=generator)

@@ -92,9 +92,14 @@ class BoxWarning(Callback):
         self.least_steps = least_steps
 
     def on_train_end(self, run: "Run") -> None:
-        """Look at the outer cells that enough views see; samplers that keep no account of cells tell nothing."""
+        """Look at the outer cells that enough views see, unless the background shows what lies beyond the box.
+
+        Samplers that keep no account of cells tell nothing.
+        """
         sampler = run.renderer.sampler
         if run.step < self.least_steps or not run.processes.is_first or not isinstance(sampler, OccupancyAware):
+            return
+        if run.renderer.background.shows_beyond:
             return
         faces = cut_faces(sampler.occupied_cells(None), run.frames)
         if faces:
