@@ -15,7 +15,7 @@ FLOORS = (
     {"samplers"},
     {"rendering", "scenes"},
     {"data", "losses", "motion"},
-    {"training", "evaluation", "visualization", "planning", "capturing"},
+    {"training", "evaluation", "visualization", "planning", "capturing", "meshing"},
 )
 OUTSIDE = {"benchmarks", "scripts", "tests"}  # know the package, which knows nothing of them
 LOOSE = {"__init__", "__main__", "_version"}  # modules of the package itself

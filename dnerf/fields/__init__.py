@@ -1,7 +1,15 @@
 """Radiance fields: density and colour at positions, directions and times."""
 
 from dnerf.core.compositing import FieldOutput
-from dnerf.fields.base import NetworkTabled, RadianceField, TimeDependence, evaluate_along_rays
+from dnerf.fields.base import (
+    HasRoughness,
+    IntervalAware,
+    NetworkTabled,
+    RadianceField,
+    SignedDistance,
+    TimeDependence,
+    evaluate_along_rays,
+)
 from dnerf.fields.deformed import CachedField, DeformedField
 from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
@@ -9,6 +17,7 @@ from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.fields.surroundings import Surroundings
 
 __all__ = [
-    "CachedField", "DeformedField", "FieldOutput", "GridField", "NeRFField", "NetworkTabled",
-    "RadianceField", "SpaceTimeVolumes", "Surroundings", "TimeDependence", "evaluate_along_rays",
+    "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware", "NeRFField",
+    "NetworkTabled", "RadianceField", "SignedDistance", "SpaceTimeVolumes", "Surroundings", "TimeDependence",
+    "evaluate_along_rays",
 ]  # fmt: skip

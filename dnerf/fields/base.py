@@ -50,6 +50,33 @@ class TimeDependence(ABC):
         """Whether density and colour are the same at all times."""
 
 
+class IntervalAware(ABC):
+    """A field that knows its mean density over an interval better than from one point within it."""
+
+    @abstractmethod
+    def between(self, starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        """Mean density (...,) over straight intervals between positions (..., 3), and rgb (..., 3) in their middle.
+
+        Mean density times the interval's length is its optical depth. Intervals of length zero have a finite density.
+        """
+
+
+class SignedDistance(ABC):
+    """A field with a surface: the zero set of a signed distance, negative inside."""
+
+    @abstractmethod
+    def distance(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Signed distance (...,), in world units, at positions (..., 3) and times (...,), with gradients."""
+
+
+class HasRoughness(ABC):
+    """A part that keeps values on lattices, whose differences between neighbours may be given a price."""
+
+    @abstractmethod
+    def roughness(self) -> tuple[Tensor, Tensor]:
+        """Of neighbours in space, and of second differences in time (zero without time): scalars."""
+
+
 @dataclass(frozen=True)
 class NetworkTables:
     """A canonical field at one time as the fused frame kernel reads it, see `dnerf.kernels.trace_network`."""

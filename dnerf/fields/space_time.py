@@ -7,13 +7,14 @@ from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive
 from dnerf.deformations.base import check_positions_times
+from dnerf.fields.base import HasRoughness
 from dnerf.kernels import GridLevels, grid_encode
 
 AXES = ((0, 1), (0, 2), (1, 2))
 """The axes of space of each volume; time is its third."""
 
 
-class SpaceTimeVolumes(nn.Module):
+class SpaceTimeVolumes(nn.Module, HasRoughness):
     """Features `(1 + a(x, y, t)) (1 + b(x, z, t)) (1 + c(y, z, t)) - 1`, interpolated at several resolutions.
 
     A body that moves leaves a tube in each volume, and a place and time belong to it where all three tubes say so: four

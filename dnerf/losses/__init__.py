@@ -3,9 +3,9 @@
 from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import AppearanceConstancyLoss, ElasticLoss, JacobianDeterminantLoss, RestLoss, VolumeLoss
 from dnerf.losses.photometric import PhotometricLoss
-from dnerf.losses.regularizers import SpaceTimeSmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
+from dnerf.losses.regularizers import SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 
 __all__ = [
     "AppearanceConstancyLoss", "Batch", "ElasticLoss", "JacobianDeterminantLoss", "Loss",
-    "PhotometricLoss", "RestLoss", "SpaceTimeSmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss", "VolumeLoss",
+    "PhotometricLoss", "RestLoss", "SmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss", "VolumeLoss",
 ]  # fmt: skip

@@ -9,7 +9,7 @@ from dnerf.core.checks import as_box, check_positive
 from dnerf.core.compositing import Rendering
 from dnerf.core.schedules import Schedule
 from dnerf.deformations import unwrapped
-from dnerf.fields import SpaceTimeVolumes
+from dnerf.fields.base import HasRoughness
 from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import deformed
 from dnerf.nn.encodings import TimeEncoding
@@ -106,8 +106,8 @@ class UnseenSpaceLoss(Loss):
         return (x * size + y) * size + z
 
 
-class SpaceTimeSmoothnessLoss(Loss):
-    """Roughness of space-time volumes: each time is seen from one side, and neighbouring times are alike.
+class SmoothnessLoss(Loss):
+    """Roughness of what a field keeps on lattices (volumes, planes, voxels): neighbours are alike, in space and time.
 
     Squared differences of neighbours in space and second differences in time, means over each table: what moves evenly
     costs nothing in time, so that what one image leaves open is as in those before and after.
@@ -128,9 +128,9 @@ class SpaceTimeSmoothnessLoss(Loss):
         self.time_weight = time_weight
 
     def check(self, model: Renderer) -> None:
-        """Needs space-time volumes."""
+        """Needs a part with lattices, see `HasRoughness`."""
         if not self._parts(model):
-            raise ValueError("SpaceTimeSmoothnessLoss needs a field with space-time volumes, this one has none")
+            raise ValueError("SmoothnessLoss needs a field with a part of `HasRoughness`, this one has none")
 
     def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
         """Roughness in space, plus that in time times its factor."""
@@ -140,8 +140,8 @@ class SpaceTimeSmoothnessLoss(Loss):
             total = total + in_space + self.time_weight * in_time
         return total
 
-    def _parts(self, model: Renderer) -> list[SpaceTimeVolumes]:
-        return [part for part in model.field.modules() if isinstance(part, SpaceTimeVolumes)]
+    def _parts(self, model: Renderer) -> list[HasRoughness]:
+        return [part for part in model.field.modules() if isinstance(part, HasRoughness)]
 
 
 class TimeEmbeddingLoss(Loss):

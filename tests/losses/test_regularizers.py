@@ -12,7 +12,7 @@ from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.rays import Samples
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes
-from dnerf.losses import Batch, Loss, PhotometricLoss, SpaceTimeSmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
+from dnerf.losses import Batch, Loss, PhotometricLoss, SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 
@@ -206,16 +206,16 @@ def test_rough_volumes_cost() -> None:
     volumes = SpaceTimeVolumes(BOX, (4,), (1,))
     field = DeformedField(IdentityDeformation(), GridField(BOX, (4,), 2, space_time=volumes))
     renderer, rgb = Renderer(field, StratifiedSampler(4)), torch.zeros(2, 3)
-    SpaceTimeSmoothnessLoss().check(renderer)
+    SmoothnessLoss().check(renderer)
     in_space, in_time = (float(x.detach()) for x in volumes.roughness())
     assert in_space > 0 == in_time  # two times have no second difference
-    loss = SpaceTimeSmoothnessLoss(time_weight=7.0)(shown(rgb), of(rgb), renderer)
+    loss = SmoothnessLoss(time_weight=7.0)(shown(rgb), of(rgb), renderer)
     assert loss.item() == pytest.approx(in_space)
     assert torch.autograd.grad(loss, volumes.tables[0])[0].abs().sum() > 0
-    with pytest.raises(ValueError, match="SpaceTimeSmoothnessLoss needs a field with space-time volumes"):
-        SpaceTimeSmoothnessLoss().check(RENDERER)
+    with pytest.raises(ValueError, match="SmoothnessLoss needs a field with a part of `HasRoughness`"):
+        SmoothnessLoss().check(RENDERER)
     with pytest.raises(ValueError, match="time_weight must be >= 0"):
-        SpaceTimeSmoothnessLoss(time_weight=-1.0)
+        SmoothnessLoss(time_weight=-1.0)
 
 
 def of_embeddings(values: list[float]) -> tuple[Renderer, torch.nn.Parameter]:
