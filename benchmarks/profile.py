@@ -38,7 +38,6 @@ PARTS: dict[str, tuple[str, ...]] = {
     "series in time and direction": (
         "dnerf::series_sums", "dnerf::series_sums_grad_coefficients", "dnerf::series_sums_grad_basis",
     ),
-    "control graph": ("dnerf::blend_rigid", "dnerf::blend_rigid_grad"),
     "optimiser": ("aten::_fused_adam_",),
     "sines and cosines": ("aten::sin", "aten::cos"),
     "activations, forward and backward": (

@@ -87,8 +87,7 @@ def test_every_loss_joins_the_flow() -> None:
 def test_every_callback_joins_the_training(callback: str, tmp_path: Path) -> None:
     if callback == "tensorboard":
         pytest.importorskip("tensorboard")
-    served = ("deformation=control_graph", "sampler=occupancy") if callback == "place_nodes" else ()
-    data, renderer, trainer = parts(*TINY, *served, f"+trainer/callbacks={callback}")
+    data, renderer, trainer = parts(*TINY, f"+trainer/callbacks={callback}")
     assert isinstance(trainer.callbacks[callback], Callback)
     assert trainer.fit(renderer, data.frames("train"), folder=tmp_path).step == 2
 

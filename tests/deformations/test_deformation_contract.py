@@ -9,7 +9,6 @@ from torch import Tensor
 from dnerf.deformations import (
     AlongRaysDeformation,
     CachedDeformation,
-    ControlGraphDeformation,
     Deformation,
     DisplacementDeformation,
     FlowChain,
@@ -57,7 +56,6 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
             for name in ("first", "second")
         }
     ),
-    "control graph": lambda: ControlGraphDeformation(BOX, 16, 4, hidden_features=16, num_layers=2, time_embeddings=5),
     "along rays": lambda: AlongRaysDeformation(small_displacement(), 0.1),
     "cached": lambda: CachedDeformation(small_displacement(), BOX),
 }
