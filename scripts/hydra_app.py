@@ -1,6 +1,5 @@
 """What the scripts share: Hydra entry points with one-line errors, objects from configs, saved configs."""
 
-import logging
 import os
 import re
 import signal
@@ -10,7 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import hydra
 import sweeps
@@ -27,11 +26,10 @@ from dnerf.core.process import prepare_process
 from dnerf.data import SceneRecord
 from dnerf.rendering.renderer import Renderer
 from dnerf.training import runs
-from dnerf.training.distributed import LostProcess, is_launched
 from dnerf.training.signals import TrainingStopped
 
 WRONG_INPUT = 2
-USER_ERRORS = (ValueError, OSError, MemoryError, LostProcess, HydraException, OmegaConfBaseException)
+USER_ERRORS = (ValueError, OSError, MemoryError, HydraException, OmegaConfBaseException)
 NO_MEMORY = "DefaultCPUAllocator"
 PATHS = (
     "data.root", "data_root", "out_dir", "run", "output", "out", "table", "path.file", "path.transforms", "film",
@@ -110,43 +108,28 @@ def _one_line_errors() -> Iterator[None]:
     try:
         yield
     except TrainingStopped as stop:
-        if int(os.environ.get("RANK", "0")) == 0:
-            print(f"{stop}; continue with resume=true", file=sys.stderr)
-        _leave(stop.exit_code)
+        print(f"{stop}; continue with resume=true", file=sys.stderr)
+        sys.exit(stop.exit_code)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        _leave(128 + signal.SIGINT)
+        sys.exit(128 + signal.SIGINT)
     except USER_ERRORS as error:
         if os.environ.get("DNERF_TRACEBACK") == "1":
             raise
-        rank = os.environ.get("RANK", "0")
-        print(f"error: {f'process {rank}: ' if rank != '0' else ''}{one_line(error)}", file=sys.stderr)
-        _leave(WRONG_INPUT)
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        sys.exit(WRONG_INPUT)
     except BrokenProcessPool as error:
         print(
             f"error: a worker of the sweep was killed ({one_line(error)[:200]}); the same command with resume=true "
             "runs what is missing",
             file=sys.stderr,
         )
-        _leave(WRONG_INPUT)
+        sys.exit(WRONG_INPUT)
     except Exception as error:
         if NO_MEMORY in str(error) and os.environ.get("DNERF_TRACEBACK") != "1":  # torch has no class for it
             print(f"error: {one_line(error).partition(NO_MEMORY)[2].lstrip(': ')}", file=sys.stderr)
-            _leave(WRONG_INPUT)
-        if not is_launched():
-            raise
-        traceback.print_exc()
-        _leave(1)
-
-
-def _leave(code: int) -> NoReturn:
-    """End this process; one of several at once, since taking down a group that has lost a member may hang."""
-    if is_launched():
-        logging.shutdown()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    sys.exit(code)
+            sys.exit(WRONG_INPUT)
+        raise
 
 
 def _tell_workers_where_we_are() -> None:
@@ -198,10 +181,10 @@ def build(config: DictConfig, *, trusted: bool = False) -> Any:
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device of a name; "auto" is CUDA where there is one. Under torchrun "cuda" is each process's own GPU.
+    """The device of a name; "auto" is CUDA where there is one.
 
     Raises:
-        ValueError: for an unknown device or one that is not there, or more processes than GPUs.
+        ValueError: for an unknown device or one that is not there.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -213,14 +196,6 @@ def resolve_device(name: str) -> torch.device:
         raise ValueError(f"device must be auto, cpu, cuda or cuda:<index>, got {name!r}")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {name!r} was asked for, but torch sees no CUDA device")
-    if device.type == "cuda" and device.index is None and is_launched():
-        index, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
-        if index >= count:
-            raise ValueError(
-                f"device {name!r} gives each process a GPU of its own, but this one is number {index} here and torch "
-                f"sees {count}; start fewer (--nproc_per_node={count}) or ask for device=cpu"
-            )
-        return torch.device("cuda", index)
     return device
 
 

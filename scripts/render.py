@@ -1,15 +1,11 @@
 """Render a film of a run: python scripts/render.py run=runs/mutant path=orbit num_frames=60 format=mp4"""
 
 import hashlib
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from datetime import timedelta
 from pathlib import Path
 
-import torch
-import torch.distributed
 from film_views import film_views
 from hydra_app import build, load_config, load_renderer, load_scene, moved, resolve_device, run_app
 from omegaconf import DictConfig, ListConfig
@@ -24,7 +20,6 @@ from dnerf.samplers import OccupancySampler
 from dnerf.visualization import (
     FILM_FORMATS,
     FrameStore,
-    Share,
     View,
     check_outputs,
     empty_frames,
@@ -45,7 +40,6 @@ def main(config: DictConfig) -> None:
         check_fps(config.fps, format)
     saved = load_config(config.run)
     scene = load_scene(config.run)
-    share = Share(int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
     device = resolve_device(config.device)
     renderer = load_renderer(config.run, saved, device)
     _subdivide(renderer, config.subdivision)
@@ -61,28 +55,20 @@ def main(config: DictConfig) -> None:
     }  # fmt: skip
     path = _output(config, formats)
     store = FrameStore(path.parent / f".{path.name}.{sequence_digest(views, facts)}", len(views))
-    if share.size > 1:
-        torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))
-    if share.rank == 0:
-        write_plan(store, views, facts)
-    missing = [i for i in store.missing() if share.mine(i)]
-    kept = len(views) - len(store.missing())
-    if kept and share.rank == 0:
-        print(f"{kept} of {len(views)} frames are there already")
-    with tqdm(total=len(missing), unit="frame", disable=share.rank > 0, dynamic_ncols=True) as bar:
+    write_plan(store, views, facts)
+    missing = store.missing()
+    if len(missing) < len(views):
+        print(f"{len(views) - len(missing)} of {len(views)} frames are there already")
+    with tqdm(total=len(missing), unit="frame", dynamic_ncols=True) as bar:
         render_frames_to(
-            store, renderer, views, outputs, truth=truth, chunk=chunk, share=share, on_frame=lambda _: bar.update(),
+            store, renderer, views, outputs, truth=truth, chunk=chunk, on_frame=lambda _: bar.update(),
             unit=scene.world.similarity.scale,
         )  # fmt: skip
-    if share.size > 1:
-        torch.distributed.barrier()
-        torch.distributed.destroy_process_group()
-    if share.rank == 0:
-        for written in write_films(store, path, outputs, formats, fps=config.fps, views=views, world=scene.world):
-            print(f"{len(views)} frames: {written}")
-        _warn(config.path, renderer, store, outputs, scene)
-        if not config.keep_frames:
-            store.remove()
+    for written in write_films(store, path, outputs, formats, fps=config.fps, views=views, world=scene.world):
+        print(f"{len(views)} frames: {written}")
+    _warn(config.path, renderer, store, outputs, scene)
+    if not config.keep_frames:
+        store.remove()
 
 
 def _warn(path: DictConfig, renderer: Renderer, store: FrameStore, outputs: list[str], scene: SceneRecord) -> None:

@@ -21,8 +21,8 @@ from dnerf.training.checkpoint_folder import CHECKPOINTS, CheckpointFolder
 
 # What may be another when a run is continued: how long, where and how it is watched, not what is trained.
 CHANGEABLE = (
-    "out_dir", "resume", "device", "process_timeout", "data_root", "evaluate_split", "evaluate_frames", "chunk",
-    "data.root", "trainer.num_steps", "trainer.max_seconds", "trainer.log_every", "trainer.callbacks.box_warning",
+    "out_dir", "resume", "device", "data_root", "evaluate_split", "evaluate_frames", "chunk", "data.root",
+    "trainer.num_steps", "trainer.max_seconds", "trainer.log_every", "trainer.callbacks.box_warning",
     *(f"trainer.callbacks.{name}" for name in ("checkpoints", "log", "tensorboard", "previews", "progress_bar")),
 )  # fmt: skip
 OWN_FOLDERS = (CHECKPOINTS, "previews")

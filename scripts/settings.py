@@ -67,7 +67,7 @@ EVERYWHERE: Mapping[str, Kind] = {
 KINDS: Mapping[str, Mapping[str, Kind]] = {
     "train": {
         "out_dir": TEXT.or_null(), "resume": TRUTH, "evaluate_split": SPLIT, "evaluate_frames": POSITIVE.or_null(),
-        "chunk": POSITIVE, "process_timeout": NUMBER,
+        "chunk": POSITIVE,
     },
     "evaluate": {
         "run": TEXT.or_null(), "runs": TEXTS, "protocol": TEXT.or_null(), "split": SPLIT, "label": TEXT.or_null(),

@@ -1,7 +1,6 @@
 """Train a model: python scripts/train.py experiment=demo [data=blender data.root=... out_dir=... key=value ...]"""
 
 import json
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -23,45 +22,38 @@ from dnerf.data.source import DataSource, NoImages
 from dnerf.evaluation.provenance import commit, hardware
 from dnerf.planning.plan import FILE
 from dnerf.rendering.renderer import Renderer
-from dnerf.training.distributed import Processes, started
 from dnerf.training.records import TrainingRecord
 from dnerf.training.runs import WEIGHTS
 from dnerf.training.tensor_files import save_weights
 
 
 def main(config: DictConfig) -> None:
-    """Train, alone or as one of the processes that torchrun started."""
+    """Train, from the first step on or where the run in the folder stands."""
     device = resolve_device(config.device)
-    with started(device, config.process_timeout) as processes, ExitStack() as held:
-        train(processes.from_first(lambda: continued(config)), config.resume, device, processes, held)
+    train(continued(config), config.resume, device)
 
 
-def train(config: DictConfig, resume: bool, device: torch.device, processes: Processes, held: ExitStack) -> None:
+def train(config: DictConfig, resume: bool, device: torch.device) -> None:
     """Build data, model and trainer; train; save weights, facts and scores in the run's folder."""
     data = build(config.data, trusted=True)
     unscored = _unscored(config, data)
-    world = processes.from_first(lambda: find_world(config, resume, data))
+    world = find_world(config, resume, data)
     data.settle(world)
     frames = data.frames("train")
     config, background = suited(config, world, frames)
-    # The same seed in every process: they begin with one model.
     torch.manual_seed(config.seed)
     renderer, trainer = (build(config[name], trusted=True) for name in ("renderer", "trainer"))
     parts = planning.parts_of(config)
     given = planning.given_choices(config, parts, frames, folder_of(config)) if parts else {}
-    folder = processes.from_first(lambda: held.enter_context(opened(config)))
-    plan, begun = None, None
-    if parts:
-        if processes.size == 1:
+    with opened(config) as folder:
+        plan, begun = None, None
+        if parts:
             plan, begun = planning.decide(config, parts, given, frames, device, folder)
-        else:  # the first one decides, and training begins anew
-            plan = processes.from_first(lambda: planning.decide(config, parts, given, frames, device, folder)[0])
-        config = planning.as_planned(config, parts, plan.choices, folder)
-        torch.manual_seed(config.seed)
-        renderer, trainer = (build(config[name], trusted=True) for name in ("renderer", "trainer"))
-    renderer = renderer.to(device) if begun is None else begun.renderer
-    said = background_contradiction(renderer.background.constant(), frames)
-    if processes.is_first:
+            config = planning.as_planned(config, parts, plan.choices, folder)
+            torch.manual_seed(config.seed)
+            renderer, trainer = (build(config[name], trusted=True) for name in ("renderer", "trainer"))
+        renderer = renderer.to(device) if begun is None else begun.renderer
+        said = background_contradiction(renderer.background.constant(), frames)
         if not (resume and (folder / SCENE).exists()):
             data.record().write(folder)
         if plan is not None:
@@ -76,10 +68,7 @@ def train(config: DictConfig, resume: bool, device: torch.device, processes: Pro
             print(note)
         for warning in (*world.warnings, *([said] if said else [])):
             print(f"warning: {warning}")
-    record = trainer.fit(
-        renderer, frames, seed=config.seed, folder=folder, resume=resume, processes=processes, begun=begun
-    )
-    if processes.is_first:
+        record = trainer.fit(renderer, frames, seed=config.seed, folder=folder, resume=resume, begun=begun)
         finish(config, resume, folder, renderer, data, record)
 
 

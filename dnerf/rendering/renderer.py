@@ -29,7 +29,7 @@ def has_fixed_capacity(sampler: Sampler) -> bool:
 
 
 class Renderer(nn.Module):
-    """Renders rays of a radiance field; the one module that is trained, saved and shared between processes.
+    """Renders rays of a radiance field; the one module that is trained and saved.
 
     Args:
         field: what is rendered.

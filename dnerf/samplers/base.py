@@ -17,9 +17,6 @@ from dnerf.kernels import MarchGrid
 class Sampler(nn.Module, ABC):
     """Places samples along rays. Training mode may place them at random, evaluation mode never does."""
 
-    observed: tuple[str, ...] = ()  # buffers that `observe` raises; processes that train together take their maximum
-    update_every: int = 1  # steps between updates that look at them
-
     @abstractmethod
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Samples along R rays, dense or packed; samplers that look where something is evaluate the field.

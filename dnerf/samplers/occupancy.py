@@ -55,8 +55,6 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         ValueError: for numbers out of range.
     """
 
-    observed = ("grid.maxima",)
-
     def __init__(
         self, grid: OccupancyGrid, step_size: float | Schedule = 0.02, *, subdivision: int = 1,
         render_subdivision: int | None = None, subdivision_weight: float = 0.0, subdivide_from: float = 0.5,
@@ -80,7 +78,6 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         self.grid = grid
         self.step_schedule = step_size
         self.step_size = at(step_size, 1.0)
-        self.update_every = grid.update_every
         self.subdivision, self.render_subdivision = subdivision, render_subdivision
         self.subdivision_weight, self.min_weight = subdivision_weight, min_weight
         self.subdivide_from, self.narrow_from = subdivide_from, narrow_from
@@ -108,7 +105,7 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         return samples.padded(self.pad_to)
 
     def update(self, field: RadianceField, step: int) -> None:
-        """Every `update_every` steps, probe cells of the field and decide anew which are occupied."""
+        """Every `grid.update_every` steps, probe cells of the field and decide anew which are occupied."""
         probes = self.probes(step)
         if probes is not None:
             self.learn(field, probes)

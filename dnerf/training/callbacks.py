@@ -22,7 +22,7 @@ BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
 
 
 class Callback:
-    """Called by the trainer around its steps, in every process; the clock stands still meanwhile.
+    """Called by the trainer around its steps; the clock stands still meanwhile.
 
     A callback may change the model (and then calls `run.renderer.invalidate()`), take back a record
     (`run.take_back()`: later callbacks do not see it) or raise. They are called in the order in which they are given,
@@ -59,13 +59,13 @@ class Callback:
 
 
 class ProgressBar(Callback):
-    """A progress bar on standard error, in the first process."""
+    """A progress bar on standard error."""
 
     _bar: tqdm | None = None
 
     def on_train_begin(self, run: "Run") -> None:
         """Draw it."""
-        self._bar = tqdm(total=100, disable=not run.processes.is_first, dynamic_ncols=True, bar_format=BAR)
+        self._bar = tqdm(total=100, dynamic_ncols=True, bar_format=BAR)
 
     def on_step_end(self, run: "Run") -> None:
         """Bring it up to date at every record."""
@@ -97,7 +97,7 @@ class BoxWarning(Callback):
         Samplers that keep no account of cells tell nothing.
         """
         sampler = run.renderer.sampler
-        if run.step < self.least_steps or not run.processes.is_first or not isinstance(sampler, OccupancyAware):
+        if run.step < self.least_steps or not isinstance(sampler, OccupancyAware):
             return
         if run.renderer.background.shows_beyond:
             return

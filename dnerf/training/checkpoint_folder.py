@@ -98,13 +98,11 @@ class Checkpoints(Callback):
         """
         self._folder = CheckpointFolder(run.folder_for(self) / CHECKPOINTS)
         self._data = fingerprint(run.frames)
-        content = None
-        if run.resume:
-            content = run.processes.from_first(lambda: self._folder.read(max_bytes(run)))
+        content = self._folder.read(max_bytes(run)) if run.resume else None
         if content is not None:
             restore_run(run, content, self._folder.folder, self._data)
             logger.info("continuing after step %d", run.step)
-        elif run.step and run.processes.is_first:  # what was done before this run began is kept, too
+        elif run.step:  # what was done before this run began is kept, too
             self._folder.save(run.step, encode_run(run, self._data))
 
     def on_step_end(self, run: Run) -> None:
@@ -117,9 +115,6 @@ class Checkpoints(Callback):
         """
         is_last = run.ends or run.signal != 0
         if not is_last and (self.every is None or run.step % self.every):
-            return
-        run.processes.merge_observations(run.renderer)
-        if not run.processes.is_first:
             return
         try:
             if names := not_finite(run.renderer):

@@ -35,7 +35,7 @@ class JsonLinesLog(Callback):
 
     def on_step_end(self, run: Run) -> None:
         """Append a record."""
-        if run.record is None or not run.processes.is_first:
+        if run.record is None:
             return
         path = run.folder_for(self) / self.name
         if not self._is_trimmed and path.exists():
@@ -76,17 +76,16 @@ class Previews(Callback):
     def on_train_begin(self, run: Run) -> None:
         """Read the frame; a continued run goes on after the images that are there."""
         self._folder = run.folder_for(self) / "previews"
-        if run.processes.is_first:
-            if (run.folder_for(self) / SCENE).exists():
-                self.data.settle(SceneRecord.read(run.folder_for(self)).world)
-            frames = self.data.frames(self.split)
-            self._frame = frames.subset([len(frames) // 2])
+        if (run.folder_for(self) / SCENE).exists():
+            self.data.settle(SceneRecord.read(run.folder_for(self)).world)
+        frames = self.data.frames(self.split)
+        self._frame = frames.subset([len(frames) // 2])
         steps = [int(path.stem.partition("_")[2]) for path in self._folder.glob("step_*.png")]
         self._next = max(steps, default=0) + self.every
 
     def on_step_end(self, run: Run) -> None:
         """Render the preview at the first record after `every` steps."""
-        if run.record is None or run.step < self._next or not run.processes.is_first:
+        if run.record is None or run.step < self._next:
             return
         self._next = run.step + self.every
         scores: list[Any] = []
@@ -114,8 +113,7 @@ class TensorBoardLog(Callback):
 
     def on_train_begin(self, run: Run) -> None:
         """Open the files."""
-        folder = str(run.folder_for(self) / "tensorboard")
-        self._writer = self._make(folder) if run.processes.is_first else None
+        self._writer = self._make(str(run.folder_for(self) / "tensorboard"))
 
     def on_step_end(self, run: Run) -> None:
         """Write a record."""

@@ -11,7 +11,6 @@ from dnerf.data.frames import Frames
 from dnerf.data.pixel_samplers import PixelSampler
 from dnerf.rendering.renderer import Renderer
 from dnerf.training.callbacks import Callback
-from dnerf.training.distributed import Processes
 from dnerf.training.optimizer import AdamMuon
 from dnerf.training.records import TrainingRecord
 
@@ -27,7 +26,6 @@ class Run:
     losses: nn.ModuleDict  # terms by name
     pixels: PixelSampler  # draws the pixels of a step
     callbacks: Mapping[str, Callback] = field(default_factory=dict)  # by name, in the order of their calls
-    processes: Processes = field(default_factory=Processes)  # those that train together
     folder: Path | None = None  # of the run's files
     resume: bool = False  # whether to continue what lies in the folder
     num_rays: int = 1  # of the next step

@@ -1,12 +1,11 @@
 """One optimiser step: pixels are rendered, compared and learnt from; op by op, or replayed as a CUDA graph."""
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dnerf.core.schedules import Schedule, at
 from dnerf.data.frames import Frames, composite_on
@@ -25,7 +24,7 @@ ROUND_TO = 256  # rays, where places are fixed
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one process finds in a step; what lies on the device holds until the next."""
+    """What is found in a step; what lies on the device holds until the next."""
 
     scalars: Mapping[str, Tensor]  # loss terms by name, "loss", "mse", "opacity" and "contrast"
     errors: Tensor  # (R,) squared, of the pixels; -1 where a ray found no places
@@ -37,13 +36,12 @@ class Stepper:
 
     Args:
         run: whose renderer, losses, frames and optimiser are meant.
-        model: what is called with rays: the renderer, or what wraps it.
         capacity: places for samples, if their number is fixed.
         graphs: replays steps, for a fixed number of places; None for steps op by op.
     """
 
-    def __init__(self, run: Run, model: nn.Module, capacity: Capacity | None, graphs: GraphCache | None) -> None:
-        self.run, self.model, self.capacity, self.graphs = run, model, capacity, graphs
+    def __init__(self, run: Run, capacity: Capacity | None, graphs: GraphCache | None) -> None:
+        self.run, self.capacity, self.graphs = run, capacity, graphs
         self.losses: dict[str, Loss] = {name: cast(Loss, loss) for name, loss in run.losses.items()}
         device = run.renderer.device
         self._weights: dict[str, float | Tensor] = {  # what a schedule changes is a tensor: replayed steps read it
@@ -53,8 +51,8 @@ class Stepper:
         self._num_samples = 0 if capacity is None else capacity.kept
         self._wanted = torch.zeros(2, dtype=torch.int64, device=device)
 
-    def __call__(self, indices: Tensor, weight: float, randomness: Callable[[], AbstractContextManager]) -> StepResult:
-        """Learn from pixels of indices (R,), their loss times a weight; random draws are made in `randomness`."""
+    def __call__(self, indices: Tensor) -> StepResult:
+        """Learn from pixels of indices (R,)."""
         number = self.run.step + 1
         turns = [name for name, loss in self.losses.items() if number % loss.every == 0]
         for name, value in self._weights.items():
@@ -62,13 +60,12 @@ class Stepper:
                 value.fill_(at(self.losses[name].weight, self.run.progress))
 
         def work(indices: Tensor) -> dict[str, Tensor]:
-            with randomness():
-                return self._optimize(indices, turns, weight)
+            return self._optimize(indices, turns)
 
         if self.graphs is None:
             found: Mapping[str, Tensor] = work(indices)
         else:
-            state = (len(indices), weight, self._sampler.path_key(), self.run.renderer.generation)
+            state = (len(indices), self._sampler.path_key(), self.run.renderer.generation)
             found = self.graphs.run(tuple(turns), state, work, indices)
         if self.capacity is not None and number % LOOK_EVERY == 0:
             places = (self.capacity.marched, self.capacity.kept)
@@ -96,10 +93,10 @@ class Stepper:
             self._sampler.learn(renderer.field, probes)
         return {}
 
-    def _optimize(self, indices: Tensor, turns: list[str], weight: float) -> dict[str, Tensor]:
+    def _optimize(self, indices: Tensor, turns: list[str]) -> dict[str, Tensor]:
         run = self.run
         rays, rgba = run.frames.pixels(indices)
-        rendering = self.model(rays, generator=run.generator, capacity=self.capacity)
+        rendering = run.renderer(rays, generator=run.generator, capacity=self.capacity)
         samples = rendering.samples
         if samples.wanted is not None:
             self._wanted.copy_(samples.wanted)
@@ -112,7 +109,7 @@ class Stepper:
             total = total + self.losses[name].every * self._weights[name] * term
         run.optimizer.zero_grad(set_to_none=True)
         if total.requires_grad:
-            (total * weight if weight != 1 else total).backward()
+            total.backward()
             run.optimizer.step()
         errors = (rendering.rgb.detach() - batch.target).square().mean(-1)
         known = errors if rendering.is_placed is None else torch.where(rendering.is_placed, errors, -1)

@@ -22,7 +22,6 @@ from dnerf.rendering.cuda_graphs import GraphCache
 from dnerf.rendering.renderer import Renderer, has_fixed_capacity
 from dnerf.samplers import Capacity
 from dnerf.training.callbacks import Callback
-from dnerf.training.distributed import Processes
 from dnerf.training.inheritance import take_over
 from dnerf.training.optimizer import AdamSettings
 from dnerf.training.records import Limits, TrainingRecord, not_finite
@@ -53,8 +52,8 @@ class Trainer:
         optimizer: rates and how they fall; `AdamSettings()` if None.
         callbacks: by name, called in this order, required ones last (see `Callback`); none if None.
         log_every: steps between records.
-        graphs: samples in fixed numbers of places, whatever rays meet, so that on a GPU the steps of one process are
-            replayed as CUDA graphs. For samplers of `FixedCapacity`, with `target_samples`.
+        graphs: samples in fixed numbers of places, whatever rays meet, so that on a GPU steps are replayed as CUDA
+            graphs. For samplers of `FixedCapacity`, with `target_samples`.
         marched_per_sample: then, intervals in occupied cells for which there are places, per sample.
 
     Raises:
@@ -103,7 +102,6 @@ class Trainer:
         seed: int = 0,
         folder: str | Path | None = None,
         resume: bool = False,
-        processes: Processes | None = None,
         begun: Run | None = None,
     ) -> TrainingRecord:
         """Train in place; the last step's record.
@@ -117,7 +115,6 @@ class Trainer:
             folder: of the run's files, for callbacks that write some; None for none.
             resume: continue from the newest checkpoint in the folder, if there is one, exactly as if training had never
                 stopped; needs a callback that does so, `Checkpoints`.
-            processes: those that train together; None for this one alone.
             begun: a run whose first steps are done already, by a model of the same parts; None for a fresh one.
 
         Raises:
@@ -127,15 +124,14 @@ class Trainer:
             MemoryError: saying what to lower, when a GPU's memory does not suffice.
             OSError: if the last checkpoint cannot be written.
         """
-        run = self.begin(renderer, frames, seed=seed, folder=folder, resume=resume, processes=processes)
+        run = self.begin(renderer, frames, seed=seed, folder=folder, resume=resume)
         if begun is not None:
             take_over(run, begun)
         run.callbacks = self.callbacks
         for callback in self.callbacks.values():
             callback.on_train_begin(run)
-        run.num_rays = max(run.num_rays, run.processes.size)
         catching = nullcontext(StopRequest()) if folder is None else stop_requests()
-        with catching as request, run.processes.watched(), _advice_on_memory(run):
+        with catching as request, _advice_on_memory(run):
             self.advance(run, lambda: self.limits.is_finished(run.step, run.seconds), request)
         renderer.set_progress(1.0)
         renderer.eval()
@@ -151,15 +147,14 @@ class Trainer:
         seed: int = 0,
         folder: str | Path | None = None,
         resume: bool = False,
-        processes: Processes | None = None,
     ) -> Run:
         """A run before its first step, without callbacks; arguments and errors as of `fit`."""
         self.losses.load_state_dict(self._losses_at_first, strict=False)  # what they count begins anew, too
         run = Run(
             renderer, frames.to(renderer.device), self.optimizer.build(renderer),
             torch.Generator(renderer.device).manual_seed(seed), self.losses.to(renderer.device),
-            self.pixels.to(renderer.device), {}, processes or Processes(), None if folder is None else Path(folder),
-            resume, num_rays=self.num_rays, most_rays=max(self.num_rays, self.max_rays),
+            self.pixels.to(renderer.device), {}, None if folder is None else Path(folder), resume,
+            num_rays=self.num_rays, most_rays=max(self.num_rays, self.max_rays),
         )  # fmt: skip
         self._check(run)
         renderer.train()
@@ -201,48 +196,41 @@ class Trainer:
                 raise ValueError(f"losses.{name}: {error}; leave it out") from error
 
     def _stepper(self, run: Run) -> Stepper:
-        """What takes steps; it replays them where sizes are fixed, unless processes train together."""
+        """What takes steps; it replays them where sizes are fixed."""
         capacity, graphs = None, None
         if self.graphs and self.target_samples is not None:
-            places = -(-self.target_samples // run.processes.size)
-            capacity = Capacity(int(self.marched_per_sample * places), places)
-            if run.processes.size == 1:
-                run.optimizer.make_capturable()
-                graphs = GraphCache(run.renderer.device, [run.generator], list(run.renderer.parameters()))
-        return Stepper(run, run.processes.wrap(run.renderer), capacity, graphs)
+            capacity = Capacity(int(self.marched_per_sample * self.target_samples), self.target_samples)
+            run.optimizer.make_capturable()
+            graphs = GraphCache(run.renderer.device, [run.generator], list(run.renderer.parameters()))
+        return Stepper(run, capacity, graphs)
 
     def _turn(self, run: Run, stepper: Stepper, request: StopRequest) -> None:
-        """One step on this process's share of a batch, and what callbacks do around it; all take the same turns."""
+        """One step, and what callbacks do around it."""
         self._notify("on_step_begin", run)
         begin = time.perf_counter()
-        processes, generator, num_rays = run.processes, run.generator, run.num_rays
+        num_rays = run.num_rays
         run.progress = max(run.progress, self.limits.progress(run.step, run.seconds))
         run.renderer.set_progress(run.progress)
         factor = self.optimizer.factor(run.step, run.progress)
         run.optimizer.set_rates(factor * run.rate_factor)
-        processes.merge_observations(run.renderer, run.step)
         stepper.update()
-        drawn = self.pixels.draw(num_rays, run.progress, generator)
-        indices = drawn[processes.share(num_rays)]
-        # Shares may differ by a ray: weighted so, their mean is that over all rays.
-        weight = len(indices) * processes.size / num_rays
-        result = stepper(indices, weight, lambda: processes.same_randomness(generator, num_rays))
-        self.pixels.feedback(drawn, processes.all_rays(result.errors, num_rays))
+        indices = self.pixels.draw(num_rays, run.progress, run.generator)
+        result = stepper(indices)
+        self.pixels.feedback(indices, result.errors)
         if run.renderer.device.type == "cuda" and self.limits.is_recorded(run.step + 1):
             torch.cuda.synchronize(run.renderer.device)  # looking stops the clock, not what is still at work
-        seconds = run.seconds + time.perf_counter() - begin
-        run.seconds, num_samples, run.signal = processes.agree(seconds, result.num_samples, request.number)
+        run.seconds += time.perf_counter() - begin
+        run.signal = request.number
         run.step += 1
         run.rays_done += num_rays
         if self.target_samples is not None:
             target, most = self.target_samples, self.max_rays
-            rays = next_num_rays(num_rays, num_samples, target, most, run.step, is_fixed=self.graphs)
-            run.num_rays = max(rays, processes.size)
+            run.num_rays = next_num_rays(num_rays, result.num_samples, target, most, run.step, is_fixed=self.graphs)
         run.ends = self.limits.is_finished(run.step, run.seconds)
         record = None
         if run.ends or run.signal or self.limits.is_recorded(run.step):
-            scalars = {name: float(value) * weight for name, value in result.scalars.items()}  # waits for the device
-            record = self._record(run, processes.mean(scalars), num_rays, num_samples, factor)
+            scalars = {name: float(value) for name, value in result.scalars.items()}  # waits for the device
+            record = self._record(run, scalars, num_rays, result.num_samples, factor)
         run.set_record(record)
         self._notify("on_step_end", run)
 

@@ -4,7 +4,7 @@ from dnerf.core.geometry import box_planes
 from dnerf.visualization.camera_paths import fixed_path, orbit_path, pose_around, spiral_path
 from dnerf.visualization.colours import colorize, error_map, flow_colors, flow_image, scaled_image
 from dnerf.visualization.data_sheet import data_sheet
-from dnerf.visualization.films import FILM_FORMATS, Share, empty_frames, render_frames_to, write_films, write_plan
+from dnerf.visualization.films import FILM_FORMATS, empty_frames, render_frames_to, write_films, write_plan
 from dnerf.visualization.frame_outputs import OUTPUTS, check_outputs, deformation_magnitude, render_layers
 from dnerf.visualization.frame_store import FrameStore, write_npz
 from dnerf.visualization.interpolation import interpolate
@@ -17,7 +17,7 @@ from dnerf.visualization.video import comparison_sheet, contact_sheet, write_fra
 from dnerf.visualization.views import View, make_views, sequence_digest
 
 __all__ = [
-    "FILM_FORMATS", "OUTPUTS", "FrameStore", "KeyFrames", "NerfstudioPath", "Share", "Surroundings", "View",
+    "FILM_FORMATS", "OUTPUTS", "FrameStore", "KeyFrames", "NerfstudioPath", "Surroundings", "View",
     "box_planes", "check_outputs", "colorize", "comparison_sheet", "contact_sheet", "data_sheet",
     "deformation_magnitude", "draw_tracks", "empty_frames", "error_map", "film_times", "fixed_path", "flow_colors",
     "flow_image", "interpolate", "make_views", "orbit_path", "parse_key_frames", "pingpong_times", "pose_around",

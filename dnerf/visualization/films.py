@@ -1,8 +1,7 @@
-"""Films from the first frame to the finished files: rendered frame by frame, resumed, shared, put together."""
+"""Films from the first frame to the finished files: rendered frame by frame, resumed, put together."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,22 +24,6 @@ SCALE_LABELS = {"depth": "depth", "deformation": "offset"}
 MIN_VISIBLE = 1 / 255  # Opacity below which an image in 8 bits shows nothing
 
 
-@dataclass(frozen=True)
-class Share:
-    """Which frames of a film one of several processes renders: every `size`-th, from its rank on."""
-
-    rank: int = 0  # of this process, 0 <= rank < size
-    size: int = 1  # number of processes
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.rank < self.size:
-            raise ValueError(f"rank must be in 0..{self.size - 1}, got {self.rank}")
-
-    def mine(self, index: int) -> bool:
-        """Whether this process renders a frame."""
-        return index % self.size == self.rank
-
-
 def render_frames_to(
     store: FrameStore,
     renderer: Renderer,
@@ -49,7 +32,6 @@ def render_frames_to(
     *,
     truth: Truth | None = None,
     chunk: int = 16384,
-    share: Share | None = None,
     on_frame: Callable[[int], None] | None = None,
     unit: float = 1.0,
 ) -> int:
@@ -58,15 +40,13 @@ def render_frames_to(
     Args:
         store: where frames go; those it holds are left alone.
         views: the film's, as many as the store's frames; ValueError otherwise.
-        share: this process's part; all frames if None.
         on_frame: called with the index of every frame written.
         unit: world units in one of those that lengths are written in, see `render_layers`.
     """
     check_outputs(outputs)
     if len(views) != store.num_frames:
         raise ValueError(f"views must be {store.num_frames} as the store's frames, got {len(views)}")
-    share = share or Share()
-    missing = [i for i in store.missing() if share.mine(i)]
+    missing = store.missing()
 
     def finish(index: int, writing: Future[None]) -> None:
         writing.result()

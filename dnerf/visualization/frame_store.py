@@ -18,7 +18,7 @@ class FrameStore:
     """A folder of `frame_00000.npz`, ..., made upon the first frame.
 
     A file holds a frame's layers and appears when it is complete, flushed to the disk: whoever is killed loses the
-    frames in hand and nothing else. Several processes may write different frames.
+    frames in hand and nothing else.
     """
 
     def __init__(self, folder: Path, num_frames: int) -> None:

@@ -210,7 +210,7 @@ def test_what_is_known_of_parts_is_not_evaluated_again(subdivision: int, subdivi
 def test_probes_reach_every_cell_of_a_large_grid() -> None:
     """float32 has no odd numbers beyond 2^24."""
     sampler = small()
-    probes = sampler.probes(sampler.update_every)
+    probes = sampler.probes(sampler.grid.update_every)
     assert probes is not None
     cells = (probes[:, 0] * 2**25).long()  # as many as those of 16 slabs of 128 x 128 x 128
     assert 0.45 < (cells % 2).float().mean() < 0.55
@@ -268,7 +268,7 @@ def test_what_is_no_number_somewhere_empties_nothing_elsewhere_and_decays(value:
     sampler.grid.decide()
     assert bool(sampler.grid.occupied[occupied].all())
     assert bool(sampler.grid.occupied[0, 15, 15, 15])  # samples will see what is wrong there
-    for step in range(sampler.update_every, 60 * sampler.update_every, sampler.update_every):
+    for step in range(sampler.grid.update_every, 60 * sampler.grid.update_every, sampler.grid.update_every):
         sampler.update(ball, step)
     assert not bool(sampler.grid.occupied[0, 15, 15, 15])
     assert bool(sampler.grid.maxima.isfinite().all())

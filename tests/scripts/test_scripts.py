@@ -2,10 +2,8 @@
 
 import json
 
-import hydra_app
 import imageio.v3 as iio
 import pytest
-import torch
 from launcher import run_script
 
 TINY = (
@@ -146,19 +144,6 @@ def test_wrong_input_ends_in_one_line_and_exit_code_2(trained, script, arguments
     assert lines[0].startswith("error: ")
     assert named in lines[0]
     assert sorted(trained.rglob("*")) == before
-
-
-def test_each_process_has_a_gpu_of_its_own(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setenv("LOCAL_RANK", "1")
-    assert hydra_app.resolve_device("auto") == torch.device("cuda")
-    monkeypatch.setenv("WORLD_SIZE", "3")
-    assert hydra_app.resolve_device("auto") == torch.device("cuda:1")
-    assert hydra_app.resolve_device("cpu") == torch.device("cpu")
-    monkeypatch.setenv("LOCAL_RANK", "2")
-    with pytest.raises(ValueError, match=r"this one is number 2 here and torch sees 2; .*--nproc_per_node=2"):
-        hydra_app.resolve_device("cuda")
 
 
 @pytest.mark.parametrize(

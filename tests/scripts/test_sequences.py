@@ -1,12 +1,10 @@
-"""render.py, evaluate.py and report.py as a user runs them: killed and begun again, shared, by protocol, as a page."""
+"""render.py, evaluate.py and report.py as a user runs them: killed and begun again, by protocol, as a page."""
 
 import importlib
 import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -82,24 +80,6 @@ def test_a_killed_rendering_goes_on_and_gives_the_same_bytes(work, capsys):
     assert {path: path.stat().st_mtime_ns for path in finished} == before
     assert films(work / "killed") == films(work / "whole")
     assert not list((work / "whole").glob(".film.*")), "finished frames are removed"
-
-
-@pytest.mark.slow
-def test_torchrun_shares_a_sequence_and_gives_the_same_bytes(work):
-    arguments = ("run=run", "path=spiral", "num_frames=5", "format=[png,gif]", "fps=10", "outputs=[rgb,opacity,motion]")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    for name, launcher in (("one", []), ("two", ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"])):
-        command = [sys.executable, *launcher, str(ROOT / "scripts" / "render.py"), *arguments, f"output={name}/film"]
-        done = subprocess.run(
-            command, cwd=work, capture_output=True, text=True, timeout=300, check=False, env=environment
-        )
-        assert done.returncode == 0, done.stderr
-    one, two = (
-        {str(p.relative_to(f)): p.read_bytes() for p in f.rglob("*.*") if p.is_file()}
-        for f in (work / "one", work / "two")
-    )
-    assert len(one) == 3 + 3 * 5
-    assert one == two
 
 
 def test_key_frames_make_a_film_at_their_own_pace(work):

@@ -52,7 +52,7 @@ def stepper(
     generator = torch.Generator(device).manual_seed(0)
     run = Run(renderer.train(), frames.to(device), optimizer, generator, made, UniformPixels())
     graphs = None if cache is None else cache(device, [generator], list(renderer.parameters()))
-    return Stepper(run, renderer, Capacity(*places), graphs)
+    return Stepper(run, Capacity(*places), graphs)
 
 
 def pixels(frames: Frames, count: int, seed: int, device: torch.device) -> Tensor:
@@ -71,9 +71,9 @@ def test_a_step_waits_for_no_device(frames: Frames, progress: float) -> None:
     taken.run.step = 3  # the next one is the fourth, in which all terms have their turn
     with kernels.use_backend("triton"):
         indices = pixels(frames, 8, 0, renderer.device)
-        taken(indices, 1.0, nullcontext)
+        taken(indices)
         with DeviceWaits() as waits:
-            found = taken._optimize(indices, list(taken.losses), 1.0)
+            found = taken._optimize(indices, list(taken.losses))
     assert found.keys() == {*taken.losses, "loss", "mse", "opacity", "contrast", ERRORS}
     assert waits.found == []
 
@@ -108,7 +108,7 @@ def test_rays_without_places_are_not_taken_for_wrong_ones(marched: int, kept: in
     images = replace(images, images=color.contiguous())
     renderer = Renderer(Fog(), occupancy_sampler(BOX, 0.3, 8, min_weight=0.01))
     taken = stepper(renderer, images, places=(marched, kept), terms={"rgb": PhotometricLoss()})
-    result = taken(torch.arange(128), 1.0, nullcontext)
+    result = taken(torch.arange(128))
     is_known = result.errors >= 0
     assert bool(is_known.all()) == (marched + kept > 12000)
     assert is_known[:2].all()
@@ -149,7 +149,7 @@ def test_replayed_steps_are_steps(frames: Frames, device: str) -> None:
                 model.set_progress(number / 40)
                 taken.run.optimizer.set_rates(1.0)
                 taken.update()
-                result = taken(pixels(frames, 256, number, model.device), 1.0, nullcontext)
+                result = taken(pixels(frames, 256, number, model.device))
                 terms.append({name: float(value) for name, value in result.scalars.items()})
             found.append(terms)
     assert [terms.keys() for terms in found[0]] == [terms.keys() for terms in found[1]]
@@ -214,7 +214,7 @@ def test_the_weight_of_a_term_follows_its_schedule_in_replays_too(frames: Frames
             taken = stepper(small_renderer(), frames, cache=cache, terms=terms)
             for number in range(5):
                 taken.run.step, taken.run.progress = number, number / 4
-                scalars = taken(pixels(frames, 64, number, torch.device("cpu")), 1.0, nullcontext).scalars
+                scalars = taken(pixels(frames, 64, number, torch.device("cpu"))).scalars
                 assert float(scalars["loss"]) == pytest.approx((1 + number / 2) * float(scalars["rgb"]), rel=1e-6)
 
 

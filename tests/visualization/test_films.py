@@ -140,8 +140,8 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def film(folder: Path, shares: list[films.Share], stop_after: int | None = None) -> dict[str, bytes]:
-    """Render by shares, the first of them broken off after some frames and begun again."""
+def film(folder: Path, stop_after: int | None = None) -> dict[str, bytes]:
+    """Render, broken off after some frames and begun again if told so."""
     renderer, views = make_renderer(), some_views(5)
     store = films.FrameStore(folder / "frames", len(views))
 
@@ -152,12 +152,10 @@ def film(folder: Path, shares: list[films.Share], stop_after: int | None = None)
         if stop_after is not None and len(list(store.folder.iterdir())) >= stop_after:
             raise Killed
 
-    for share in shares:
-        try:
-            films.render_frames_to(store, renderer, views, ALL_BUT_DEFORMATION, truth=truth, share=share, on_frame=stop)
-        except Killed:
-            stop_after = None
-            films.render_frames_to(store, renderer, views, ALL_BUT_DEFORMATION, truth=truth, share=share)
+    try:
+        films.render_frames_to(store, renderer, views, ALL_BUT_DEFORMATION, truth=truth, on_frame=stop)
+    except Killed:
+        films.render_frames_to(store, renderer, views, ALL_BUT_DEFORMATION, truth=truth)
     assert store.missing() == []
     films.write_films(store, folder / "film", ALL_BUT_DEFORMATION, ["mp4", "gif", "png", "npz"], fps=10, views=views)
     store.remove()
@@ -165,14 +163,13 @@ def film(folder: Path, shares: list[films.Share], stop_after: int | None = None)
     return files(folder)
 
 
-def test_broken_off_and_shared_renderings_give_the_same_bytes(tmp_path: Path) -> None:
-    whole = film(tmp_path / "whole", [films.Share()])
+def test_broken_off_renderings_give_the_same_bytes(tmp_path: Path) -> None:
+    whole = film(tmp_path / "whole")
     assert {name for name in whole if "/" not in name} == {
         "film.npz",
         *(f"film{suffix}.{f}" for suffix in ("", "_depth", "_opacity", "_motion", "_compare") for f in ("mp4", "gif")),
     }
-    assert film(tmp_path / "resumed", [films.Share()], stop_after=2) == whole
-    assert film(tmp_path / "shared", [films.Share(1, 2), films.Share(0, 2)]) == whole
+    assert film(tmp_path / "resumed", stop_after=2) == whole
 
 
 KILLED = """
@@ -263,8 +260,6 @@ def test_digest_tells_sequences_apart_and_views_outside_of_time_are_refused() ->
     assert films.sequence_digest(some_views(3), facts) == names[0]
     with pytest.raises(ValueError, match=r"time must be in \[0, 1\], got 1.5"):
         films.View(some_views(1)[0].camera, 1.5)
-    with pytest.raises(ValueError, match="rank must be in"):
-        films.Share(2, 2)
 
 
 def test_a_frame_that_cannot_be_written_ends_the_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
