@@ -21,7 +21,7 @@ RATES = Rates({torch.float32: 1e9}, bandwidth=1e9, cached_bandwidth=1e9)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["flow", "kernels", "precision", "quadrature"])
+@pytest.mark.parametrize("name", ["flow", "kernels", "quadrature"])
 def test_suite_runs_at_its_quick_size(name):
     result = run_suite(name, Settings(quick=True))
     assert result.findings
