@@ -18,6 +18,7 @@ class Sampler(nn.Module, ABC):
     """Places samples along rays. Training mode may place them at random, evaluation mode never does."""
 
     observed: tuple[str, ...] = ()  # buffers that `observe` raises; processes that train together take their maximum
+    sets_bounds: bool = False  # whether the samples of training carry `Samples.bounds`, by which proposals learn
     update_every: int = 1  # steps between updates that look at them
 
     @abstractmethod
