@@ -30,6 +30,6 @@ def _sequential(films: Sequence[Sequence[str]]) -> Iterator[tuple[str, str]]:
         stride = max(1, len(film) // NUM_ANCHORS)
         anchors += film[::stride]
     yield from combinations(anchors, 2)
-    # Cameras that film at the same moment.
+    # Films that began together show the same moment in frames of the same number.
     for first, second in combinations(films, 2):
         yield from zip(first, second)

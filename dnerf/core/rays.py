@@ -69,6 +69,7 @@ class Samples:
     is_placed: Tensor | None = None  # (R,) bool, the rays that found some of a fixed number of places; None for all
     wanted: Tensor | None = None  # (2,) int64, how many of these places intervals and samples would have filled
     proposals: "tuple[tuple[Samples, FieldOutput], ...]" = ()  # earlier passes that placed these; losses read them
+    bounds: tuple[Tensor, ...] = ()  # what proposals without colours allow as weights, laid out like starts; see losses
 
     def __post_init__(self) -> None:
         if self.ray_indices is None:
@@ -79,6 +80,8 @@ class Samples:
         check_shape("ends", self.ends, self.starts.shape)
         if self.points is not None:
             check_shape("points", self.points, self.starts.shape)
+        for bound in self.bounds:
+            check_shape("bounds", bound, self.starts.shape)
         if self.ray_offsets is not None:
             check_shape("ray_offsets", self.ray_offsets, (self.num_rays + 1,))
         if self.is_placed is not None:
@@ -144,16 +147,16 @@ class Samples:
         return replace(
             self, starts=torch.cat([self.starts, self.ends[-1:].expand(padding)]), ends=extended(self.ends),
             ray_indices=extended(self.ray_indices), points=None if self.points is None else extended(self.points),
-            ray_offsets=self.offsets + padding * (self.offsets == count),
+            ray_offsets=self.offsets + padding * (self.offsets == count), bounds=tuple(map(extended, self.bounds)),
         )  # fmt: skip
 
     def kept(self, mask: Tensor) -> "Samples":
-        """Those packed samples for which `mask` (N,) holds; proposals are dropped."""
+        """Those packed samples for which `mask` (N,) holds; proposals and bounds are dropped."""
         check_shape("mask", mask, self.starts.shape)
         return self.chosen(mask.nonzero()[:, 0])
 
     def chosen(self, numbers: Tensor) -> "Samples":
-        """Those packed samples whose numbers (n,), in order, are given; proposals are dropped."""
+        """Those packed samples whose numbers (n,), in order, are given; proposals and bounds are dropped."""
         if self.ray_indices is None:
             raise ValueError("samples must be packed to be chosen from, got dense samples")
         return Samples(
@@ -190,6 +193,7 @@ class Samples:
             ends=torch.lerp(starts, ends, (number + 1) / parts),
             ray_indices=self.ray_indices[whole],
             ray_offsets=before[self.offsets],
+            bounds=tuple(bound[whole] for bound in self.bounds),
         )
 
     def fitted(self, counts: Tensor, size: int) -> "tuple[Samples, Tensor]":
@@ -233,6 +237,7 @@ class Samples:
         return replace(
             self, starts=self.starts[mask], ends=self.ends[mask],
             points=None if self.points is None else self.points[mask], ray_indices=mask.nonzero()[:, 0],
+            bounds=tuple(bound[mask] for bound in self.bounds),
         )  # fmt: skip
 
 

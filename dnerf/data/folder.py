@@ -14,7 +14,7 @@ from dnerf.data.background_check import border_color
 from dnerf.data.capture import Capture, CaptureFrame
 from dnerf.data.formats import read_capture
 from dnerf.data.frames import Frames
-from dnerf.data.loading import LoadedFrames, final_intrinsics, load_frames
+from dnerf.data.loading import LoadedFrames, check_frames, final_intrinsics, load_frames
 from dnerf.data.placing import Given, place, planes_between
 from dnerf.data.scene_record import CameraSet, World
 from dnerf.data.source import DataSource, NoImages, check_train_end, given_box
@@ -90,7 +90,7 @@ class FolderData(DataSource):
 
     def frames(self, split: str) -> Frames:
         """Read a split; ValueError for what can be wrong with its files, or if it has no images."""
-        self.check(split)
+        self._check_split(split)
         world = self.world()
         loaded = self._train if split == "train" and self._train is not None else self._load(split)
         self._train = None
@@ -127,7 +127,11 @@ class FolderData(DataSource):
         return result
 
     def check(self, split: str) -> None:
-        """Read the files that say where images and cameras are, see `DataSource.check`."""
+        """Read the files that say where images and cameras are, and look for broken images, see `DataSource.check`."""
+        self._check_split(split)
+        check_frames(self._read_of(split), resolution=self.resolution)
+
+    def _check_split(self, split: str) -> None:
         super().check(split)
         splits = self._split.splits
         if split not in splits:

@@ -12,7 +12,16 @@ from torch import Tensor
 from dnerf.core.cameras import Intrinsics
 from dnerf.core.checks import check_whole
 from dnerf.data.capture import CaptureFrame
-from dnerf.data.images import MAX_PIXELS, Bytes, finish_image, has_shape, is_transparent, read_header, read_image
+from dnerf.data.images import (
+    MAX_PIXELS,
+    Bytes,
+    check_image,
+    finish_image,
+    has_shape,
+    is_transparent,
+    read_header,
+    read_image,
+)
 from dnerf.data.pixel_store import MAX_MEMORY, empty_pixels
 from dnerf.data.videos import read_frames, video_size
 
@@ -98,6 +107,17 @@ def load_frames(
     largest = max(header.size[0] * header.size[1] for header in headers)
     _in_threads(tasks, min(MAX_THREADS, max(1, MAX_PIXELS // largest)))
     return LoadedFrames(tuple(header.frame for header in headers), images, notes)
+
+
+def check_frames(frames: Sequence[CaptureFrame], *, resolution: int | None = None) -> None:
+    """Raise ValueError as `load_frames` for files that are missing, broken or of another shape; no pixel is kept.
+
+    Of videos only the headers are read.
+    """
+    headers = [_header(frame, resolution) for frame in _present(frames)[0]]
+    paths = [header.path for header in headers if header.number is None]
+    paths += [header.frame.mask for header in headers if header.frame.mask is not None]
+    _in_threads([partial(check_image, path) for path in paths], MAX_THREADS)
 
 
 def final_intrinsics(frame: CaptureFrame, resolution: int | None = None) -> Intrinsics:

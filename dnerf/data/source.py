@@ -51,7 +51,7 @@ class DataSource(ABC):
         return SceneRecord(self.world(), self.cameras())
 
     def check(self, split: str) -> None:
-        """Raise what `frames` would of a split, as far as can be seen in no time; `NoImages` if it has none."""
+        """Raise what `frames` would of a split, as far as can be seen in little time; `NoImages` if it has none."""
         check_choice("split", split, SPLITS)
 
     def _known(self, frames: Frames, split: str) -> Frames:

@@ -76,7 +76,7 @@ def render_frames(
     """
     check_positive("oversampling", oversampling)
     if isinstance(lens, int):
-        check_positive("resolution", lens)
+        check_positive("lens", lens)
         lens = Intrinsics.from_angle(lens, lens, DNERF_ANGLE_X)
     color = None if background is None else torch.tensor(background)
     channels, n = 4 if color is None else 3, oversampling

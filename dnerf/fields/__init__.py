@@ -14,10 +14,10 @@ from dnerf.fields.deformed import CachedField, DeformedField
 from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
 from dnerf.fields.space_time import SpaceTimeVolumes
-from dnerf.fields.surroundings import Surroundings
+from dnerf.fields.surroundings import SurroundingsBackground
 
 __all__ = [
     "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware", "NeRFField",
-    "NetworkTabled", "RadianceField", "SignedDistance", "SpaceTimeVolumes", "Surroundings", "TimeDependence",
+    "NetworkTabled", "RadianceField", "SignedDistance", "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence",
     "evaluate_along_rays",
 ]  # fmt: skip

@@ -16,7 +16,7 @@ from dnerf.fields.base import RadianceField
 LEAST_DISTANCE = 1e-3  # world units; what lies at the eye itself is not seen
 
 
-class Surroundings(Background):
+class SurroundingsBackground(Background):
     """A field of all that lies beyond a box, at rest, seen where light gets through the box.
 
     Intervals begin where a ray leaves the box and are even in disparity, up to infinity: their ends are at

@@ -2,10 +2,11 @@
 
 from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import AppearanceConstancyLoss, ElasticLoss, JacobianDeterminantLoss, RestLoss, VolumeLoss
+from dnerf.losses.histogram import HistogramLoss
 from dnerf.losses.photometric import PhotometricLoss
 from dnerf.losses.regularizers import SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 
 __all__ = [
-    "AppearanceConstancyLoss", "Batch", "ElasticLoss", "JacobianDeterminantLoss", "Loss",
-    "PhotometricLoss", "RestLoss", "SmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss", "VolumeLoss",
+    "AppearanceConstancyLoss", "Batch", "ElasticLoss", "HistogramLoss", "JacobianDeterminantLoss",
+    "Loss", "PhotometricLoss", "RestLoss", "SmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss", "VolumeLoss",
 ]  # fmt: skip

@@ -17,6 +17,8 @@ from dnerf.kernels import MarchGrid
 class Sampler(nn.Module, ABC):
     """Places samples along rays. Training mode may place them at random, evaluation mode never does."""
 
+    sets_bounds: bool = False  # whether the samples of training carry `Samples.bounds`, by which proposals learn
+
     @abstractmethod
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Samples along R rays, dense or packed; samplers that look where something is evaluate the field.

@@ -138,6 +138,19 @@ def test_each_interval_can_have_its_own_number_of_parts() -> None:
             packed.split(wrong)
 
 
+def test_bounds_follow_their_samples() -> None:
+    starts = torch.tensor([[0.0, 1.0], [2.0, 4.0]])
+    dense = Samples(starts, starts + 1, 2, bounds=(starts + 10, starts + 20))
+    packed = dense.packed(starts != 1)
+    for samples, first in (
+        (packed, [0, 2, 4]), (packed.padded(4), [0, 2, 4, 4]), (packed.split(2), [0, 0, 2, 2, 4, 4]),
+    ):  # fmt: skip
+        assert [(bound - 10 * k).tolist() for k, bound in enumerate(samples.bounds, 1)] == [first, first]
+    assert packed.kept(torch.ones(3, dtype=torch.bool)).bounds == ()
+    with pytest.raises(ValueError, match="bounds must have shape"):
+        replace(packed, bounds=(starts,))
+
+
 def test_dense_samples_are_neither_chosen_from_nor_split() -> None:
     dense = Samples(torch.zeros(2, 3), torch.ones(2, 3), 2)
     with pytest.raises(ValueError, match="must be packed to be chosen from"):

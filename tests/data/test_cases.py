@@ -1,4 +1,7 @@
-"""Every data set of `data_cases` is understood as what it was made of, or refused in words that say how to go on."""
+"""Every data set of `data_cases` is understood as what it was made of, or refused in words that say how to go on.
+
+The number before a case's name tells cases apart and stays with its case when others come or go; it says nothing else.
+"""
 
 import shutil
 from pathlib import Path

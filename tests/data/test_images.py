@@ -2,6 +2,7 @@ import io
 import os
 import struct
 import zlib
+from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
-from dnerf.data.images import premultiplied_area_average, read_header, read_image, read_mask, straight_alpha
+from dnerf.data.images import (
+    check_image,
+    premultiplied_area_average,
+    read_header,
+    read_image,
+    read_mask,
+    straight_alpha,
+)
 
 
 def loop_area_average(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -298,6 +306,28 @@ def test_every_truncation_is_an_error_or_the_whole_picture(tmp_path: Path) -> No
             refused += 1
     # only the checksums and the end mark after the pixels may be lacking
     assert refused >= len(whole) - 30
+
+
+@pytest.mark.parametrize(("kind", "step"), [("PNG", 1), ("JPEG", 9)])
+def test_a_file_that_ends_early_is_found_as_when_it_is_read(tmp_path: Path, kind: str, step: int) -> None:
+    def fails(what: Callable[[Path], object]) -> bool:
+        try:
+            what(path)
+        except ValueError as error:
+            assert str(path) in str(error)  # noqa: PT017 - which of the two happens depends on the byte
+            return True
+        return False
+
+    buffer, path = io.BytesIO(), tmp_path / "a.png"
+    values = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+    Image.fromarray(values).save(buffer, kind)
+    found = []
+    for length in [*range(0, len(buffer.getvalue()), step), len(buffer.getvalue())]:
+        path.write_bytes(buffer.getvalue()[:length])
+        found.append(fails(check_image))
+        assert found[-1] == fails(partial(read_image, width=16, height=16, channels=3, size=(16, 16)))
+    assert sum(found) > 0.9 * len(found)
+    assert not found[-1]
 
 
 @pytest.mark.parametrize("start", [8, 16, 29, 41, 60])

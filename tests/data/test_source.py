@@ -135,6 +135,20 @@ def test_training_images_that_show_nothing_are_refused(folder, tmp_path, mode):
     assert len(FolderData(root, box=[[-1.0] * 3, [1.0] * 3]).frames("train")) == 11
 
 
+def test_broken_and_missing_test_images_are_found_before_training(folder, tmp_path):
+    root = Path(shutil.copytree(folder, tmp_path / "scene"))
+    FolderData(root).check("test")
+    image = sorted((root / "test").glob("*.png"))[1]
+    whole = image.read_bytes()
+    image.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=f"{image.name}: image is truncated or broken"):
+        FolderData(root).check("test")
+    FolderData(root).check("train")
+    image.unlink()
+    with pytest.raises(ValueError, match=f"{image.stem}: image does not exist"):
+        FolderData(root).check("test")
+
+
 def test_splits_without_images_have_cameras_and_no_frames(folder, tmp_path):
     root = Path(shutil.copytree(folder, tmp_path / "scene"))
     shutil.rmtree(root / "test")

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dnerf.core.compositing import FieldOutput
 from dnerf.core.rays import Rays
-from dnerf.fields import RadianceField, Surroundings
+from dnerf.fields import RadianceField, SurroundingsBackground
 from dnerf.rendering import Renderer
 from dnerf.samplers import StratifiedSampler
 
@@ -41,8 +41,8 @@ def rays(origins: list[list[float]], directions: list[list[float]]) -> Rays:
 OUTWARDS = rays([[0, 0, 0], [0, 0, 0.9], [0, 0, 3.0]], [[0, 1, 0], [0, 0, 1], [0, 0, -1]])
 
 
-def surroundings(density: float, until: float = 2.0, num_intervals: int = 24) -> Surroundings:
-    return Surroundings(BOX, Shells(density, until), num_intervals).double()
+def surroundings(density: float, until: float = 2.0, num_intervals: int = 24) -> SurroundingsBackground:
+    return SurroundingsBackground(BOX, Shells(density, until), num_intervals).double()
 
 
 @pytest.mark.parametrize("density", [0.3, 2.0])
@@ -56,6 +56,41 @@ def test_even_density_up_to_a_distance_lets_through_what_its_integral_says(densi
         errors.append(float((color.detach() - expected).abs().max()))
     assert errors[0] < 0.02 * density
     assert errors[1] < 0.3 * errors[0]  # the shell's end lies within an interval
+
+
+def test_distances_are_in_half_sides_of_an_oblong_box_and_densities_per_half_of_its_longest() -> None:
+    half = torch.tensor([0.5, 2.0, 1.0], dtype=torch.float64)
+    center = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
+    box = torch.stack([center - half, center + half]).tolist()
+    model = SurroundingsBackground(box, Shells(0.8, 2 - 1 / 4), 512).double().eval()
+    along = rays([center.tolist()] * 3, torch.eye(3).tolist())
+    # From a face at h to 4 h: the integral of density / (2 (x / h)^2), 2 is half of the longest side.
+    through = torch.exp(-0.8 * half / 2 * (1 - 1 / 4))
+    torch.testing.assert_close(model(along)[:, 2].detach(), through, rtol=0, atol=2e-3)
+
+
+class Waves(RadianceField):
+    """Density and colour that change smoothly everywhere."""
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        return 1.5 + torch.sin(positions).sum(-1) / 3
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        return FieldOutput(self.density(positions, times), torch.sigmoid(positions + directions))
+
+
+def test_gradcheck_to_rays_and_to_the_field() -> None:
+    box = [[-0.5, -2.0, -1.0], [0.5, 1.0, 1.5]]
+    through = rays([[0.1, 0.2, -0.3], [0.3, -0.5, 4.0]], [[0.3, 1, 0.2], [0.1, 0.2, -1]])
+    model = SurroundingsBackground(box, Waves(), 6).double().eval()
+
+    def shown(origins: Tensor, directions: Tensor) -> Tensor:
+        return model(Rays(origins, directions, through.times, through.near, through.far))
+
+    leaves = through.origins.clone().requires_grad_(), through.directions.clone().requires_grad_()
+    assert torch.autograd.gradcheck(shown, leaves)
+    shells = surroundings(0.7, num_intervals=6).eval()
+    assert torch.autograd.gradcheck(lambda _: shells(through), (shells.field.strength,))
 
 
 def test_nothing_gets_through_to_behind_infinity() -> None:

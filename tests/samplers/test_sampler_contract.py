@@ -9,7 +9,7 @@ from reference import fog, occupancy_sampler, rays_towards_origin, soft_ball
 
 from dnerf.core.compositing import composite
 from dnerf.core.rays import Rays, Samples
-from dnerf.samplers import ImportanceSampler, Sampler, StratifiedSampler
+from dnerf.samplers import ImportanceSampler, ProposalSampler, Sampler, StratifiedSampler
 
 BOX = torch.tensor([[-1.0, -1.2, -0.8], [0.9, 1.1, 1.3]])
 
@@ -29,6 +29,9 @@ SAMPLERS: dict[str, Callable[[], Sampler]] = {
     "occupancy, all of a box": lambda: occupancy_sampler(BOX.tolist(), 0.1, 8, num_slabs=4),
     "occupancy, filled": filled_occupancy,
     "importance, linear": lambda: ImportanceSampler(8, 12, box=BOX, quadrature="linear"),
+    "proposal": lambda: ProposalSampler([soft_ball(width=0.6), soft_ball()], (8, 8), 8),
+    "proposal, one interval": lambda: ProposalSampler([soft_ball()], (1,), 1),
+    "proposal in a box": lambda: ProposalSampler([soft_ball()], (8,), 8, box=BOX, min_weight=0.0),
     "importance in a box": lambda: ImportanceSampler(8, 12, box=BOX),
 }
 

@@ -22,7 +22,7 @@ from dnerf.data.normalization import Similarity
 from dnerf.data.pixel_samplers import ErrorGuidedPixels, TemporalCurriculum, UniformPixels
 from dnerf.data.scene_record import CameraSet, SceneRecord, World
 from dnerf.deformations import DisplacementDeformation
-from dnerf.fields import DeformedField, GridField, NeRFField, Surroundings
+from dnerf.fields import DeformedField, GridField, NeRFField, SurroundingsBackground
 from dnerf.losses import Batch, ElasticLoss, Loss, PhotometricLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 from dnerf.rendering import Renderer
 from dnerf.samplers import OccupancyGrid, OccupancySampler, StratifiedSampler
@@ -319,7 +319,7 @@ def test_a_bar_shows_progress_and_a_warning_says_where_the_box_is_left(
 
 def test_nothing_is_said_of_the_box_where_the_background_shows_what_lies_beyond(frames: Frames, caplog) -> None:
     inside = ((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2))
-    beyond = Surroundings(inside, GridField([[-2] * 3, [2] * 3], (4,), 2, hidden_features=8), 4)
+    beyond = SurroundingsBackground(inside, GridField([[-2] * 3, [2] * 3], (4,), 2, hidden_features=8), 4)
     renderer = small_renderer(sampler=OccupancySampler(OccupancyGrid(inside, 8), 0.05), background=beyond)
     trainer(callbacks={"box": BoxWarning(least_steps=20)}).fit(renderer, frames)
     assert "geometry reaches the box" not in caplog.text
