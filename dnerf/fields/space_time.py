@@ -1,11 +1,12 @@
 """Features of places at times: products of three volumes, each over two axes of space and time."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import as_box, check_positive
+from dnerf.core.checks import as_box, check_positive, check_whole
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.base import HasRoughness
 from dnerf.kernels import GridLevels, grid_encode
@@ -14,7 +15,17 @@ AXES = ((0, 1), (0, 2), (1, 2))
 """The axes of space of each volume; time is its third."""
 
 
-class SpaceTimeVolumes(nn.Module, HasRoughness):
+class SpaceTimeFeatures(nn.Module, ABC):
+    """Features of places at times, for a head to see."""
+
+    out_features: int
+
+    @abstractmethod
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Features (..., n) at positions (..., 3) and times (...,) in [0, 1]."""
+
+
+class SpaceTimeVolumes(SpaceTimeFeatures, HasRoughness):
     """Features `(1 + a(x, y, t)) (1 + b(x, z, t)) (1 + c(y, z, t)) - 1`, interpolated at several resolutions.
 
     A body that moves leaves a tube in each volume, and a place and time belong to it where all three tubes say so: four
@@ -44,11 +55,15 @@ class SpaceTimeVolumes(nn.Module, HasRoughness):
                 f"time_resolutions must have as many levels as resolutions {list(resolutions)}, "
                 f"got {list(time_resolutions)}"
             )
+        for number in time_resolutions:
+            check_whole("time_resolutions", number)
         corners = as_box(box)
         sides = corners[1] - corners[0]
         shares = (sides / sides.max()).tolist()
         self.levels = tuple(
-            _dense([[*(max(1, round(r * shares[k])) for k in axes), t] for r, t in zip(resolutions, time_resolutions)])
+            dense_levels(
+                [[*(max(1, round(r * shares[k])) for k in axes), t] for r, t in zip(resolutions, time_resolutions)]
+            )
             for axes in AXES
         )
         self.tables = nn.ParameterList(
@@ -76,16 +91,16 @@ class SpaceTimeVolumes(nn.Module, HasRoughness):
         for table, levels in zip(self.tables, self.levels, strict=True):
             for (u, v, t, first, _), size in zip(levels.describe(), levels.vertices, strict=True):
                 values = table[first : first + size].view(t + 1, v + 1, u + 1, -1)
-                space += [_mean_square(values.diff(dim=axis)) for axis in (1, 2)]
-                time.append(_mean_square(values.diff(n=2, dim=0)))
+                space += [mean_square(values.diff(dim=axis)) for axis in (1, 2)]
+                time.append(mean_square(values.diff(n=2, dim=0)))
         return torch.stack(space).sum(), torch.stack(time).sum()
 
 
-def _mean_square(values: Tensor) -> Tensor:
+def mean_square(values: Tensor) -> Tensor:
     """0 for none, as of second differences between two times."""
     return values.square().sum() / max(values.numel(), 1)
 
 
-def _dense(cells: list[list[int]]) -> GridLevels:
+def dense_levels(cells: list[list[int]]) -> GridLevels:
     """Levels of which every vertex has a row of its own."""
     return GridLevels(cells, 1 << (max(GridLevels(cells, 1).vertices) - 1).bit_length())
