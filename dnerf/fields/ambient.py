@@ -56,20 +56,14 @@ class AmbientCoordinates(SpaceTimeFeatures, DeclaresGroups):
         self.encode = SinusoidalEncoding(num_coordinates, ambient_frequencies, window_end=window_end)
         self.out_features = self.encode.out_features
 
-    def coordinates(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Ambient coordinates (..., W) at positions (..., 3) and times (...,)."""
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """The coordinates and their waves (..., n) at positions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
         if self.out_features == 0:
             return positions[..., :0]
         encoded = [*self.encode_positions.parts(positions), *self.encode_times.parts(times[..., None])]
-        return self.slicing(torch.cat(encoded, dim=-1)).to(positions.dtype)
-
-    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Encoded ambient coordinates (..., n) at positions (..., 3) and times (...,)."""
-        coordinates = self.coordinates(positions, times)
-        return coordinates if self.out_features == 0 else self.encode(coordinates)
+        return self.encode(self.slicing(torch.cat(encoded, dim=-1)).to(positions.dtype))
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """As of a deformation, which it stands beside."""
-        output = self.slicing.output if self.out_features else None
-        return network_groups(self, "deformation", output)
+        return network_groups(self, "deformation", self.slicing.output if self.out_features else None)

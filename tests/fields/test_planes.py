@@ -15,7 +15,7 @@ def filled(join: str = "product", num_times: int | None = 3) -> PlaneFeatures:
     planes = PlaneFeatures(BOX, (4, 8), num_times, num_features=2, join=join).double()
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for plane in planes.planes:
+        for plane in planes.tables:
             plane.copy_(torch.randn(plane.shape, generator=generator, dtype=torch.float64))
     return planes
 
@@ -39,9 +39,9 @@ def looked_up(planes: PlaneFeatures, positions: Tensor, times: Tensor) -> list[l
     levels, first = [], [0] * 6
     for cells in ((2, 1, 4, 3), (4, 2, 8, 3)):
         found = []
-        for number, (i, j) in enumerate(AXES[: len(planes.planes)]):
+        for number, (i, j) in enumerate(AXES[: len(planes.tables)]):
             rows = (cells[i] + 1) * (cells[j] + 1)
-            values = planes.planes[number][first[number] : first[number] + rows].view(cells[j] + 1, cells[i] + 1, 2)
+            values = planes.tables[number][first[number] : first[number] + rows].view(cells[j] + 1, cells[i] + 1, 2)
             first[number] += rows
             weights = hats(unit[:, j], cells[j]), hats(unit[:, i], cells[i])
             found.append(torch.einsum("nv,nu,vuf->nf", *weights, values))
@@ -73,7 +73,7 @@ def test_pairs_are_products_of_a_plane_and_of_what_it_leaves_out() -> None:
 def on_vertices(planes: PlaneFeatures, number: int, f: Tensor, g: Tensor, feature: int = 0) -> None:
     """One feature of one plane as a product of functions of its two axes, given on vertices."""
     with torch.no_grad():
-        planes.planes[number][:, feature] = (g[:, None] * f).reshape(-1)
+        planes.tables[number][:, feature] = (g[:, None] * f).reshape(-1)
 
 
 def test_a_product_of_functions_of_each_axis_is_exact() -> None:
@@ -89,7 +89,7 @@ def test_a_product_of_functions_of_each_axis_is_exact() -> None:
     for join, column in (("product", 0), ("pairs", 0), ("pairs", 1), ("pairs", 2)):
         planes = PlaneFeatures(BOX, (8,), 5, num_features=1, join=join).double()
         with torch.no_grad():
-            for plane in planes.planes:
+            for plane in planes.tables:
                 plane.fill_(1)
         for number in (column, column + 3):
             i, j = AXES[number]
@@ -114,7 +114,7 @@ def test_a_fresh_field_is_at_rest_and_may_move() -> None:
     assert not field.is_static
     assert torch.equal(field.density(positions, times), field.density(positions, 1 - times))
     field.density(positions, times).sum().backward()
-    assert all(plane.grad.abs().sum() > 0 for plane in field.planes.planes)  # type: ignore[union-attr]
+    assert all(plane.grad.abs().sum() > 0 for plane in field.planes.tables)  # type: ignore[union-attr]
     assert PlanesField(PlaneFeatures(BOX, (4,), None)).is_static
     assert not PlanesField(PlaneFeatures(BOX, (4,), None), temporal_terms=2).is_static
 
@@ -142,12 +142,12 @@ def test_gradients_are_those_of_finite_differences(join: str) -> None:
 
 def test_roughness_is_of_differences_in_space_and_of_second_differences_in_time() -> None:
     planes = PlaneFeatures([[0, 0, 0], [1, 1, 1]], (4, 2), 5, num_features=2).double()
-    for plane in planes.planes:
+    for plane in planes.tables:
         torch.nn.init.constant_(plane, 0.7)
     assert [float(x.detach()) for x in planes.roughness()] == [0, 0]
     slopes = (0.5, -2.0, 3.0)  # along the first axis, the second of space, and time squared
     with torch.no_grad():
-        for (_, j), plane, levels in zip(AXES, planes.planes, planes.levels, strict=True):
+        for (_, j), plane, levels in zip(AXES, planes.tables, planes.levels, strict=True):
             for (u, v, _), first in zip(levels.resolutions, levels.offsets[:2], strict=True):
                 b, a = torch.meshgrid(torch.arange(v + 1.0), torch.arange(u + 1.0), indexing="ij")
                 values = slopes[0] * a + (slopes[2] * b**2 / 2 + 5 * b if j == 3 else slopes[1] * b)
