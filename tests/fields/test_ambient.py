@@ -4,19 +4,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from dnerf.deformations import DisplacementDeformation
-from dnerf.fields import AmbientCoordinates, DeformedField, GridField, PlaneFeatures, PlanesField, RadianceField
-from dnerf.nn.parameter_groups import collect_groups
+from dnerf.fields import AmbientCoordinates, GridField
 
 BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 
 
-def grid(ambient: AmbientCoordinates | None) -> RadianceField:
+def grid(ambient: AmbientCoordinates | None) -> GridField:
     return GridField(BOX, (4, 8), 2, hidden_features=16, temporal_terms=2, window_end=0.5, space_time=ambient)
-
-
-def planes(ambient: AmbientCoordinates | None) -> RadianceField:
-    return PlanesField(PlaneFeatures(BOX, (4,), None), hidden_features=16, space_time=ambient)
 
 
 def some_points(count: int = 60) -> tuple[Tensor, Tensor, Tensor]:
@@ -25,9 +19,8 @@ def some_points(count: int = 60) -> tuple[Tensor, Tensor, Tensor]:
     return positions, torch.nn.functional.normalize(positions, dim=-1), torch.rand(count, generator=generator)
 
 
-@pytest.mark.parametrize("make", [grid, planes])
-def test_without_coordinates_it_is_the_field_without(make) -> None:
-    without, field = make(None), make(AmbientCoordinates(0))
+def test_without_coordinates_it_is_the_field_without() -> None:
+    without, field = grid(None), grid(AmbientCoordinates(0))
     field.load_state_dict(without.state_dict())  # no parameter more
     expected, found = without(*some_points()), field(*some_points())
     assert torch.equal(found.density, expected.density)
@@ -35,13 +28,10 @@ def test_without_coordinates_it_is_the_field_without(make) -> None:
     assert not list(AmbientCoordinates(0).parameters())
 
 
-@pytest.mark.parametrize("make", [grid, planes])
-def test_a_fresh_field_is_as_without_and_learns(make) -> None:
+def test_a_fresh_field_is_as_without_and_learns() -> None:
     """The head's other weights are the same; those of the new columns see zeros."""
-    without, field = make(None), make(AmbientCoordinates(2))
-    state = without.state_dict()
-    wider = field.state_dict()
-    first = next(name for name, value in state.items() if value.shape != wider[name].shape)
+    without, field = grid(None), grid(AmbientCoordinates(2))
+    state, wider, first = without.state_dict(), field.state_dict(), "head.hidden.0.weight"
     state[first] = torch.cat([state[first], wider[first][:, state[first].shape[1] :]], dim=1)
     field.load_state_dict({**wider, **state})
     assert not field.space_time(*some_points()[::2]).any()
@@ -73,13 +63,6 @@ def test_gradcheck() -> None:
     places, _, times = (x.double() for x in some_points(4))
     # A kink of a ReLU within a finite difference of 1e-7 is unlikely.
     assert torch.autograd.gradcheck(ambient, (places.requires_grad_(), times.requires_grad_()), eps=1e-7, atol=1e-5)
-
-
-def test_it_learns_at_the_rates_of_the_deformation_it_stands_beside() -> None:
-    model = DeformedField(DisplacementDeformation(1, 16), grid(AmbientCoordinates(2)))
-    groups = {g.name: {id(p) for p in g.parameters} for g in collect_groups(model) if not g.orthogonal}
-    assert id(model.canonical.space_time.slicing.output.weight) in groups["deformation_output"]
-    assert id(model.canonical.space_time.slicing.hidden[0].bias) in groups["deformation"]
 
 
 def test_what_vanishes_is_learnt_where_nothing_else_in_the_field_sees_time() -> None:

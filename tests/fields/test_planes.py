@@ -49,31 +49,25 @@ def looked_up(planes: PlaneFeatures, positions: Tensor, times: Tensor) -> list[l
     return levels
 
 
-def test_features_are_products_of_all_planes() -> None:
+@pytest.mark.parametrize("num_times", [3, None])
+def test_planes_are_multiplied_all_or_each_with_what_it_leaves_out(num_times: int | None) -> None:
+    """In pairs, level by level: xy with zt, xz with yt, yz with xt."""
     positions, times = some_places()
-    for num_times in (3, None):
-        planes = filled(num_times=num_times)
-        found = [torch.stack(level).prod(0) for level in looked_up(planes, positions, times)]
-        torch.testing.assert_close(planes(positions, times), torch.cat(found, dim=1), rtol=1e-12, atol=1e-12)
-        assert planes.out_features == 4
+    for join in ("product", "pairs"):
+        planes = filled(join, num_times)
+        found = looked_up(planes, positions, times)
+        if join == "product":
+            expected = [torch.stack(level).prod(0) for level in found]
+        else:
+            rest = torch.ones(3) if num_times is None else None
+            expected = [a * b for x in found for a, b in zip(x[:3], x[3:] if rest is None else rest, strict=True)]
+        torch.testing.assert_close(planes(positions, times), torch.cat(expected, dim=1), rtol=1e-12, atol=1e-12)
         assert planes.is_static == (num_times is None)
 
 
-def test_pairs_are_products_of_a_plane_and_of_what_it_leaves_out() -> None:
-    """Level by level, xy with zt, xz with yt, yz with xt."""
-    positions, times = some_places()
-    planes = filled("pairs")
-    found = [a * b for level in looked_up(planes, positions, times) for a, b in zip(level[:3], level[3:])]
-    torch.testing.assert_close(planes(positions, times), torch.cat(found, dim=1), rtol=1e-12, atol=1e-12)
-    space = filled("pairs", None)
-    found = [x for level in looked_up(space, positions, times) for x in level]
-    torch.testing.assert_close(space(positions, times), torch.cat(found, dim=1), rtol=1e-12, atol=1e-12)
-
-
-def on_vertices(planes: PlaneFeatures, number: int, f: Tensor, g: Tensor, feature: int = 0) -> None:
-    """One feature of one plane as a product of functions of its two axes, given on vertices."""
-    with torch.no_grad():
-        planes.tables[number][:, feature] = (g[:, None] * f).reshape(-1)
+def on_vertices(planes: PlaneFeatures, number: int, f: Tensor, g: Tensor) -> None:
+    """One plane of one feature as a product of functions of its two axes, given on vertices."""
+    planes.tables[number].data[:, 0] = (g[:, None] * f).reshape(-1)
 
 
 def test_a_product_of_functions_of_each_axis_is_exact() -> None:
@@ -88,21 +82,21 @@ def test_a_product_of_functions_of_each_axis_is_exact() -> None:
         expected = expected * (hats(unit[:, axis], count) @ function)
     for join, column in (("product", 0), ("pairs", 0), ("pairs", 1), ("pairs", 2)):
         planes = PlaneFeatures(BOX, (8,), 5, num_features=1, join=join).double()
-        with torch.no_grad():
-            for plane in planes.tables:
-                plane.fill_(1)
+        for plane in planes.tables:
+            torch.nn.init.ones_(plane)
         for number in (column, column + 3):
             i, j = AXES[number]
             on_vertices(planes, number, values[i], values[j])
         torch.testing.assert_close(planes(positions, times)[:, column], expected, rtol=1e-12, atol=1e-12)
 
 
-def test_a_sum_of_three_products_is_exact_in_pairs_alone() -> None:
-    """sin(x) + sin(y) + sin(z) of vertices: a sum of the three columns, and beyond any product."""
+def test_a_sum_of_three_products_is_exact_in_pairs() -> None:
+    """sin(x) + sin(y) + sin(z) of vertices: a sum of the three columns."""
     planes = PlaneFeatures([[0, 0, 0], [1, 1, 1]], (4,), 2, num_features=1, join="pairs").double()
     waves = torch.sin(3 * torch.linspace(0, 1, 5, dtype=torch.float64))
-    for number, along_first in ((0, True), (1, False), (2, True)):  # x of xy, z of xz, y of yz
-        on_vertices(planes, number, *((waves, torch.ones(5)) if along_first else (torch.ones(5), waves)))
+    ones = torch.ones(5, dtype=torch.float64)
+    for number, functions in enumerate(((waves, ones), (ones, waves), (waves, ones))):  # x of xy, z of xz, y of yz
+        on_vertices(planes, number, *functions)
     grid = torch.cartesian_prod(*[torch.linspace(0, 1, 5, dtype=torch.float64)] * 3)
     found = planes(grid, torch.full((125,), 0.3, dtype=torch.float64)).sum(1)
     torch.testing.assert_close(found, torch.sin(3 * grid).sum(1), rtol=1e-12, atol=1e-12)
@@ -119,15 +113,6 @@ def test_a_fresh_field_is_at_rest_and_may_move() -> None:
     assert not PlanesField(PlaneFeatures(BOX, (4,), None), temporal_terms=2).is_static
 
 
-def test_places_outside_see_the_nearest_face() -> None:
-    planes = filled()
-    low, high = torch.tensor(BOX, dtype=torch.float64)
-    positions, times = some_places()
-    positions = positions + 3 * (positions - (low + high) / 2)
-    inside = torch.minimum(torch.maximum(positions, low), high)
-    torch.testing.assert_close(planes(positions, times), planes(inside, times), rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("join", ["product", "pairs"])
 def test_gradients_are_those_of_finite_differences(join: str) -> None:
     planes = filled(join)
@@ -141,20 +126,13 @@ def test_gradients_are_those_of_finite_differences(join: str) -> None:
 
 
 def test_roughness_is_of_differences_in_space_and_of_second_differences_in_time() -> None:
-    planes = PlaneFeatures([[0, 0, 0], [1, 1, 1]], (4, 2), 5, num_features=2).double()
-    for plane in planes.tables:
-        torch.nn.init.constant_(plane, 0.7)
-    assert [float(x.detach()) for x in planes.roughness()] == [0, 0]
-    slopes = (0.5, -2.0, 3.0)  # along the first axis, the second of space, and time squared
-    with torch.no_grad():
-        for (_, j), plane, levels in zip(AXES, planes.tables, planes.levels, strict=True):
-            for (u, v, _), first in zip(levels.resolutions, levels.offsets[:2], strict=True):
-                b, a = torch.meshgrid(torch.arange(v + 1.0), torch.arange(u + 1.0), indexing="ij")
-                values = slopes[0] * a + (slopes[2] * b**2 / 2 + 5 * b if j == 3 else slopes[1] * b)
-                plane[first : first + values.numel()] = values.reshape(-1, 1).double()
-    in_space, in_time = planes.roughness()
-    assert float(in_space.detach()) == pytest.approx(2 * (6 * slopes[0] ** 2 + 3 * slopes[1] ** 2))  # of two levels
-    assert float(in_time.detach()) == pytest.approx(2 * 3 * slopes[2] ** 2)
+    planes = PlaneFeatures([[0, 0, 0], [1, 1, 1]], (4,), 5, num_features=1)
+    for (_, j), plane, levels in zip(AXES, planes.tables, planes.levels, strict=True):
+        a, b, _ = (torch.arange(n + 1.0) for n in levels.resolutions[0])
+        plane.data[:, 0] = ((1.5 * b**2 + 5 * b if j == 3 else -2 * b)[:, None] + 0.5 * a).reshape(-1)
+    in_space, in_time = (float(x.detach()) for x in planes.roughness())
+    assert in_space == pytest.approx(6 * 0.5**2 + 3 * 2**2)
+    assert in_time == pytest.approx(3 * 3**2)
     assert float(filled(num_times=None).roughness()[1]) == 0
 
 
