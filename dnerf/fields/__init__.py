@@ -1,6 +1,7 @@
 """Radiance fields: density and colour at positions, directions and times."""
 
 from dnerf.core.compositing import FieldOutput
+from dnerf.fields.ambient import AmbientCoordinates
 from dnerf.fields.base import (
     HasRoughness,
     IntervalAware,
@@ -13,11 +14,12 @@ from dnerf.fields.base import (
 from dnerf.fields.deformed import CachedField, DeformedField
 from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
+from dnerf.fields.planes import PlaneFeatures, PlanesField
 from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.fields.surroundings import SurroundingsBackground
 
 __all__ = [
-    "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware", "NeRFField",
-    "NetworkTabled", "RadianceField", "SignedDistance", "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence",
-    "evaluate_along_rays",
+    "AmbientCoordinates", "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware",
+    "NeRFField", "NetworkTabled", "PlaneFeatures", "PlanesField", "RadianceField", "SignedDistance",
+    "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence", "evaluate_along_rays",
 ]  # fmt: skip

@@ -23,10 +23,10 @@ class GridLevels:
     A level with (Rx, Ry, Rz) cells has (Rx + 1)(Ry + 1)(Rz + 1) vertices. It is dense if they fit into `max_rows`
     rows, x varying fastest; otherwise vertex (x, y, z) takes row
     `(x ^ y * 2654435761 ^ z * 805459861) mod max_rows` (Mueller et al. 2022, "Instant neural graphics primitives",
-    eq. 4), and collisions are left to training.
+    eq. 4), and collisions are left to training. A dense level without cells along z is a plane: z counts for nothing.
 
     Args:
-        resolutions: per level the number of cells per axis, one int or three.
+        resolutions: per level the number of cells per axis, one int or three, of which the last may be 0.
         max_rows: most rows of one level, a power of two.
 
     Raises:
@@ -38,7 +38,7 @@ class GridLevels:
 
     def __post_init__(self) -> None:
         triples = tuple((r, r, r) if isinstance(r, int) else tuple(int(c) for c in r) for r in self.resolutions)
-        if not triples or any(len(r) != 3 or min(r) < 1 for r in triples):
+        if not triples or any(len(r) != 3 or min(r[0], r[1], r[2] + 1) < 1 for r in triples):
             raise ValueError(f"resolutions must be positive ints or triples of them, got {self.resolutions}")
         if not 0 < self.max_rows < 2**31 or self.max_rows & (self.max_rows - 1):
             raise ValueError(f"max_rows must be a power of two below 2^31, got {self.max_rows}")
@@ -129,10 +129,10 @@ def grid_encode_reference(positions: Tensor, table: Tensor, levels: GridLevels) 
     for rx, ry, rz, offset, mask in levels.describe():
         cells = torch.tensor((rx, ry, rz), device=positions.device)
         scaled = clamped * cells.to(positions.dtype)
-        lower = scaled.detach().floor().long().clamp(min=torch.zeros_like(cells), max=cells - 1)
+        lower = scaled.detach().floor().long().clamp(min=torch.zeros_like(cells), max=(cells - 1).clamp(min=0))
         fraction = (scaled - lower.to(scaled.dtype))[:, None]
         weights = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
-        x, y, z = (lower[:, None] + corners).unbind(-1)
+        x, y, z = torch.minimum(lower[:, None] + corners, cells).unbind(-1)
         if mask >= 0:
             rows = (x * HASH_PRIMES[0] ^ y * HASH_PRIMES[1] ^ z * HASH_PRIMES[2]) & mask
         else:

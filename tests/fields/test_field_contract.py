@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 import torch
@@ -9,7 +10,16 @@ from torch import Tensor
 
 from dnerf.core.compositing import FieldOutput
 from dnerf.deformations import DisplacementDeformation, IdentityDeformation
-from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField, SpaceTimeVolumes
+from dnerf.fields import (
+    AmbientCoordinates,
+    DeformedField,
+    GridField,
+    NeRFField,
+    PlaneFeatures,
+    PlanesField,
+    RadianceField,
+    SpaceTimeVolumes,
+)
 from dnerf.fields.base import TimeDependence, field_at_time
 
 
@@ -32,7 +42,7 @@ def small_displacement() -> DisplacementDeformation:
     return DisplacementDeformation(2, 16, (), position_frequencies=3, time_frequencies=3)
 
 
-def small_grid(**options: int) -> GridField:
+def small_grid(**options: Any) -> GridField:
     box = [[-1, -1.5, -1], [1, 1.5, 2]]
     return GridField(box, (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1, **options)
 
@@ -46,6 +56,17 @@ def small_space_time(view_degree: int | None = None) -> GridField:
     )  # fmt: skip
 
 
+def small_planes(num_times: int | None = 3, view_degree: int | None = None, join: str = "product") -> PlanesField:
+    planes = PlaneFeatures([[-1, -1.5, -1], [1, 1.5, 2]], (4, 9), num_times, num_features=2, join=join)
+    return PlanesField(planes, hidden_features=16, num_layers=1, view_degree=view_degree)
+
+
+def small_ambient() -> GridField:
+    ambient = AmbientCoordinates(2, hidden_features=16, num_layers=1)
+    ambient.encode.set_progress(1.0)
+    return small_grid(space_time=ambient)
+
+
 FIELDS = {
     "nerf": Case(small_nerf), "nerf, exp density": Case(lambda: small_nerf(density_activation="exp")),
     "nerf, view-dependent": Case(lambda: small_nerf(view_dependent=True), view_dependent=True),
@@ -55,6 +76,9 @@ FIELDS = {
     "grid, space-time and view-dependent": Case(lambda: small_space_time(2), True),
     "grid, timed": Case(lambda: small_grid(time_frequencies=3)),
     "grid, timed and view-dependent": Case(lambda: small_grid(time_frequencies=3, view_degree=2), True),
+    "planes": Case(small_planes), "planes of space": Case(lambda: small_planes(None)),
+    "planes, view-dependent": Case(lambda: small_planes(3, 2), True), "grid, ambient": Case(small_ambient),
+    "planes in pairs": Case(lambda: small_planes(join="pairs")),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),
     "deformed, view-dependent": Case(lambda: DeformedField(small_displacement(), small_nerf(True)), True),

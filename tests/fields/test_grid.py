@@ -208,7 +208,7 @@ def test_tables_for_the_frame_kernel_are_all_that_the_field_shows(options: dict)
 
 @pytest.mark.parametrize(("options", "part"), [
     ({"density_activation": "softplus"}, "density_activation=softplus"), ({"num_layers": 0}, "num_layers=0"),
-    ({"space_time": SpaceTimeVolumes(BOX, (4,), (3,))}, "space_time volumes"),
+    ({"space_time": SpaceTimeVolumes(BOX, (4,), (3,))}, "space_time features"),
 ])  # fmt: skip
 def test_parts_that_the_frame_kernel_does_not_serve_are_named_once(
     options: dict, part: str, caplog: pytest.LogCaptureFixture

@@ -130,7 +130,7 @@ def test_the_head_sees_them() -> None:
 @pytest.mark.parametrize(("arguments", "message"), [
     (([[0, 0, 0], [1, 0, 1]],), "box must have finite corners"),
     ((BOX, (4, 8), (2,)), r"time_resolutions must have as many levels as resolutions \[4, 8\], got \[2\]"),
-    ((BOX, (), ()), "resolutions"), ((BOX, (4,), (0,)), "resolutions must be positive"),
+    ((BOX, (), ()), "resolutions"), ((BOX, (4,), (0,)), "time_resolutions must be > 0"),
 ])  # fmt: skip
 def test_bad_volumes_are_refused(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):

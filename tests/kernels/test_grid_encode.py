@@ -14,6 +14,7 @@ from dnerf.kernels.grid_encode import grid_encode_reference
 
 # Dense, hashed and anisotropic levels.
 LEVELS = GridLevels((3, (5, 2, 7), 16), max_rows=256)
+PLANES = GridLevels(((5, 2, 0), (3, 3, 3), (9, 7, 0)), max_rows=256)
 
 
 def example(num_samples, levels=LEVELS, num_features=3, dtype=torch.float64, seed=0):
@@ -109,12 +110,27 @@ def test_numba_agrees_with_reference_on_random_grids(num_samples, num_features, 
     torch.testing.assert_close(*both(GridLevels(resolutions, 2**log_rows), num_samples, num_features, seed=seed))
 
 
+def test_a_plane_is_a_bilinear_interpolation_that_no_third_coordinate_moves(compiled):
+    levels = GridLevels(((5, 2, 0), (9, 7, 0)), max_rows=256)
+    assert levels.num_rows == 6 * 3 + 10 * 8
+    positions, table = (x.to(compiled) for x in example(150, levels))
+    points = (2 * positions.clamp(0, 1) - 1)[None, None, :, :2]
+    planes = [part.T.reshape(1, 3, rows, -1) for part, rows in zip(table.split([18, 80]), (3, 8))]
+    expected = torch.cat([torch.nn.functional.grid_sample(x, points, align_corners=True)[0, :, 0] for x in planes]).T
+    torch.testing.assert_close(grid_encode(positions, table, levels), expected, rtol=1e-9, atol=1e-9)
+    grad = torch.ones(150, 6, dtype=table.dtype, device=table.device)
+    _, along, _ = values_and_gradients(positions, table, levels, grad)
+    assert not along[:, 2].any()
+    assert along[:, :2].any()
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("num_samples", [0, 1, 150])
-def test_compiled_agrees_with_reference(compiled, dtype, num_samples):
+@pytest.mark.parametrize("grid", [LEVELS, PLANES], ids=["cells", "planes"])
+def test_compiled_agrees_with_reference(compiled, grid, dtype, num_samples):
     # Sums of some tens of terms of size one, scaled by up to 16 cells in the gradient to positions.
     tolerance = 2e-5 if dtype == torch.float32 else 1e-12
-    found = both(LEVELS, num_samples, dtype=dtype, device=compiled, backend=kernels.get_backend())
+    found = both(grid, num_samples, dtype=dtype, device=compiled, backend=kernels.get_backend())
     torch.testing.assert_close(*found, rtol=tolerance, atol=tolerance)
 
 

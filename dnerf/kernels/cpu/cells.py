@@ -86,13 +86,14 @@ def _locate_some(typing: Any, places: Any, i: Any, level: Any, rows: Any, fracti
             builder.store(values, pointer, align=array_type.dtype.bitwidth // 8)
 
         cells = [builder.extract_value(level_, axis) for axis in range(3)]
+        is_deep = builder.zext(builder.icmp_signed(">", cells[2], LONG(0)), LONG)  # or a plane
         lower = []
         for axis, size in enumerate(cells):
             place = load(context, builder, places, places_, _place(builder, axis, i_), AT_ONCE)
             scaled = builder.fmul(place, splat(builder, builder.sitofp(size, real), AT_ONCE))
             is_number = builder.fcmp_ordered("ord", scaled, scaled)
             known = builder.fptosi(builder.select(is_number, scaled, ir.Constant(reals, [0.0] * AT_ONCE)), words)
-            last = builder.sub(spread(size), constant(1))
+            last = builder.sub(spread(size), spread(is_deep) if axis == 2 else constant(1))
             vertex = builder.select(builder.icmp_signed("<", known, last), known, last)
             store(builder.fsub(scaled, builder.sitofp(vertex, reals)), fractions, fractions_, axis)
             lower.append(vertex)
@@ -101,6 +102,7 @@ def _locate_some(typing: Any, places: Any, i: Any, level: Any, rows: Any, fracti
         row_y = builder.add(spread(cells[0]), constant(1))
         row_z = builder.mul(row_y, builder.add(spread(cells[1]), constant(1)))
         first = builder.add(x, builder.add(builder.mul(y, row_y), builder.mul(z, row_z)))
+        row_z = builder.mul(row_z, spread(is_deep))
         mask = builder.extract_value(level_, 3)
         is_hashed, masks = builder.icmp_signed(">=", mask, LONG(0)), spread(mask)
         primes = [constant(prime) for prime in HASH_PRIMES]

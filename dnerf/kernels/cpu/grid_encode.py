@@ -102,7 +102,7 @@ def _grad_table(
                 for i in range(count):
                     u, v, w = fractions_at(fractions, i)
                     weights, corners = trilinear_weights(u, v, w), rows_at(rows, i)
-                    for k in range(8):
+                    for k in range(8 if level[2] else 4):  # of a plane, the others weigh nothing
                         row = level[3] + corners[k]
                         if part_bits == 0 or (row >> ROW_BLOCK_BITS) & part_mask == part:
                             add_to_row(out, row, weights[k], grad, start, lanes)

@@ -60,7 +60,7 @@ def _locate(positions, samples, mask, levels, level, axis: tl.constexpr):
     position = tl.load(positions + samples * 3 + axis, mask, 0.0)
     clamped = tl.where(position < 0, 0.0, tl.where(position > 1, 1.0, position)).to(position.dtype)
     scaled = clamped * cells.to(position.dtype)
-    lower = tl.minimum(tl.where(scaled >= 0, scaled, 0.0).to(tl.int64), cells - 1)
+    lower = tl.minimum(tl.where(scaled >= 0, scaled, 0.0).to(tl.int64), tl.maximum(cells - 1, 0))
     return lower, scaled - lower.to(position.dtype)
 
 
@@ -69,6 +69,7 @@ def _row(x, y, z, levels, level):
     """Table row of a vertex."""
     cells_x, cells_y = tl.load(levels + level * 5), tl.load(levels + level * 5 + 1)
     offset, hash_mask = tl.load(levels + level * 5 + 3), tl.load(levels + level * 5 + 4)
+    z = tl.minimum(z, tl.load(levels + level * 5 + 2))  # a plane has one vertex
     hashed = (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & hash_mask
     return offset + tl.where(hash_mask < 0, x + (cells_x + 1) * (y + (cells_y + 1) * z), hashed)
 
