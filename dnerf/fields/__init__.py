@@ -15,9 +15,10 @@ from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
 from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.fields.surroundings import Surroundings
+from dnerf.fields.voxels import VoxelField
 
 __all__ = [
     "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware", "NeRFField",
     "NetworkTabled", "RadianceField", "SignedDistance", "SpaceTimeVolumes", "Surroundings", "TimeDependence",
-    "evaluate_along_rays",
+    "VoxelField", "evaluate_along_rays",
 ]  # fmt: skip

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dnerf.core.compositing import FieldOutput
 from dnerf.deformations import DisplacementDeformation, IdentityDeformation
-from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField, SpaceTimeVolumes
+from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField, SpaceTimeVolumes, VoxelField
 from dnerf.fields.base import TimeDependence, field_at_time
 
 
@@ -55,6 +55,7 @@ FIELDS = {
     "grid, space-time and view-dependent": Case(lambda: small_space_time(2), True),
     "grid, timed": Case(lambda: small_grid(time_frequencies=3)),
     "grid, timed and view-dependent": Case(lambda: small_grid(time_frequencies=3, view_degree=2), True),
+    "voxels": Case(lambda: VoxelField([[-1, -1.5, -1], [1, 1.5, 2]], (4, 9), view_resolution=4), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),
     "deformed, view-dependent": Case(lambda: DeformedField(small_displacement(), small_nerf(True)), True),
