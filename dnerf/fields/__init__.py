@@ -16,10 +16,12 @@ from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
 from dnerf.fields.planes import PlaneFeatures, PlanesField
 from dnerf.fields.space_time import SpaceTimeVolumes
-from dnerf.fields.surroundings import SurroundingsBackground
+from dnerf.fields.surroundings import Surroundings, SurroundingsBackground
+from dnerf.fields.voxels import VoxelField
 
 __all__ = [
     "AmbientCoordinates", "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware",
     "NeRFField", "NetworkTabled", "PlaneFeatures", "PlanesField", "RadianceField", "SignedDistance",
-    "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence", "evaluate_along_rays",
+    "SpaceTimeVolumes", "Surroundings", "SurroundingsBackground", "TimeDependence", "VoxelField",
+    "evaluate_along_rays",
 ]  # fmt: skip

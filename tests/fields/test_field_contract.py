@@ -19,6 +19,7 @@ from dnerf.fields import (
     PlanesField,
     RadianceField,
     SpaceTimeVolumes,
+    VoxelField,
 )
 from dnerf.fields.base import TimeDependence, field_at_time
 
@@ -79,6 +80,7 @@ FIELDS = {
     "planes": Case(small_planes), "planes of space": Case(lambda: small_planes(None)),
     "planes, view-dependent": Case(lambda: small_planes(3, 2), True), "grid, ambient": Case(small_ambient),
     "planes in pairs": Case(lambda: small_planes(join="pairs")),
+    "voxels": Case(lambda: VoxelField([[-1, -1.5, -1], [1, 1.5, 2]], (4, 9), view_resolution=4), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),
     "deformed, view-dependent": Case(lambda: DeformedField(small_displacement(), small_nerf(True)), True),
