@@ -4,8 +4,9 @@ from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import AppearanceConstancyLoss, ElasticLoss, JacobianDeterminantLoss, RestLoss, VolumeLoss
 from dnerf.losses.photometric import PhotometricLoss
 from dnerf.losses.regularizers import SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
+from dnerf.losses.surfaces import EikonalLoss
 
 __all__ = [
-    "AppearanceConstancyLoss", "Batch", "ElasticLoss", "JacobianDeterminantLoss", "Loss",
+    "AppearanceConstancyLoss", "Batch", "EikonalLoss", "ElasticLoss", "JacobianDeterminantLoss", "Loss",
     "PhotometricLoss", "RestLoss", "SmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss", "VolumeLoss",
 ]  # fmt: skip
