@@ -5,9 +5,11 @@ from dnerf.samplers.importance import ImportanceSampler
 from dnerf.samplers.inverse_cdf import sample_piecewise_constant
 from dnerf.samplers.occupancy import OccupancySampler
 from dnerf.samplers.occupancy_grid import OccupancyGrid
+from dnerf.samplers.sphere_tracing import SphereTracingSampler
 from dnerf.samplers.stratified import StratifiedSampler
 
 __all__ = [
     "Capacity", "FixedCapacity", "FrontToBack", "ImportanceSampler", "OccupancyAware", "OccupancyGrid",
-    "OccupancySampler", "OccupiedCells", "Sampler", "StratifiedSampler", "sample_piecewise_constant",
+    "OccupancySampler", "OccupiedCells", "Sampler", "SphereTracingSampler", "StratifiedSampler",
+    "sample_piecewise_constant",
 ]  # fmt: skip

@@ -9,7 +9,16 @@ from torch import Tensor
 
 from dnerf.core.compositing import FieldOutput
 from dnerf.deformations import DisplacementDeformation, IdentityDeformation
-from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField, SpaceTimeVolumes
+from dnerf.fields import (
+    DeformedField,
+    GridField,
+    NeRFField,
+    NeuSField,
+    RadianceField,
+    SDFField,
+    SpaceTimeVolumes,
+    VolSDFField,
+)
 from dnerf.fields.base import TimeDependence, field_at_time
 
 
@@ -46,6 +55,12 @@ def small_space_time(view_degree: int | None = None) -> GridField:
     )  # fmt: skip
 
 
+def small_sdf(kind: type[SDFField], view_degree: int | None = None) -> SDFField:
+    box = [[-1, -1.5, -1], [1, 1.5, 2]]
+    options = {"max_rows": 64, "hidden_features": 16, "num_layers": 1, "view_degree": view_degree}
+    return kind(box, (4, 9), 2, **options, radius=0.5, width=0.3)
+
+
 FIELDS = {
     "nerf": Case(small_nerf), "nerf, exp density": Case(lambda: small_nerf(density_activation="exp")),
     "nerf, view-dependent": Case(lambda: small_nerf(view_dependent=True), view_dependent=True),
@@ -55,6 +70,8 @@ FIELDS = {
     "grid, space-time and view-dependent": Case(lambda: small_space_time(2), True),
     "grid, timed": Case(lambda: small_grid(time_frequencies=3)),
     "grid, timed and view-dependent": Case(lambda: small_grid(time_frequencies=3, view_degree=2), True),
+    "sdf, NeuS": Case(lambda: small_sdf(NeuSField)), "sdf, VolSDF": Case(lambda: small_sdf(VolSDFField)),
+    "sdf, view-dependent": Case(lambda: small_sdf(NeuSField, 2), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),
     "deformed, view-dependent": Case(lambda: DeformedField(small_displacement(), small_nerf(True)), True),
