@@ -169,7 +169,11 @@ def test_broken_off_and_shared_renderings_give_the_same_bytes(tmp_path: Path) ->
     whole = film(tmp_path / "whole", [films.Share()])
     assert {name for name in whole if "/" not in name} == {
         "film.npz",
-        *(f"film{suffix}.{f}" for suffix in ("", "_depth", "_opacity", "_motion", "_compare") for f in ("mp4", "gif")),
+        *(
+            f"film{suffix}.{f}"
+            for suffix in ("", "_depth", "_opacity", "_motion", "_normals", "_compare")
+            for f in ("mp4", "gif")
+        ),
     }
     assert film(tmp_path / "resumed", [films.Share()], stop_after=2) == whole
     assert film(tmp_path / "shared", [films.Share(1, 2), films.Share(0, 2)]) == whole
