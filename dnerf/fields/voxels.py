@@ -64,7 +64,9 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         if not resolutions or list(resolutions) != sorted(set(resolutions)):
             raise ValueError(f"resolutions must ascend, one level at least, got {list(resolutions)}")
         if view_degree and view_resolution < resolutions[0]:
-            raise ValueError(f"view_resolution must be {resolutions[0]}, the first level's, at least, got {view_resolution}")
+            raise ValueError(
+                f"view_resolution must be {resolutions[0]}, the first level's, at least, got {view_resolution}"
+            )
         if window_end is not None and not 0 < window_end <= 1:
             raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
         corners = as_box(box)
