@@ -32,7 +32,8 @@ def fit_box(frames: Frames, points: Tensor | None = None) -> Tensor:
 
     - Images with alpha: what their opaque pixels can show (`carve`), with room around it. No opaque pixel looks past
       the box.
-    - Otherwise sparse points, if there are any: what holds nearly all of them, with more room.
+    - Otherwise sparse points, if there are any: what holds nearly all of those that a tenth of the cameras see between
+      their planes, with more room.
     - Otherwise, if one colour is behind the scene, the same as with alpha, of the pixels that have another one.
     - Otherwise what a tenth of the cameras see between their planes: the images show something everywhere.
 
@@ -47,6 +48,8 @@ def fit_box(frames: Frames, points: Tensor | None = None) -> Tensor:
         points = points[points.isfinite().all(-1)]
         if not len(points):
             raise ValueError("points must hold a finite one, got none")
+        share = share_of_views(frames, points)
+        points = points[share >= SHARES[1] * share.max()]
         ends = torch.tensor([QUANTILE, 1 - QUANTILE], dtype=points.dtype, device=points.device)
         return _with_room(torch.quantile(points, ends, dim=0), ROOM_AROUND_POINTS)
     behind = background_color(frames)

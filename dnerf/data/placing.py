@@ -14,7 +14,15 @@ from dnerf.data.bounds import check_views, fit_box, opaque_without_room
 from dnerf.data.frames import Frames
 from dnerf.data.normalization import LONGEST_SIDE, Similarity, Vector, upright
 from dnerf.data.scene_record import Box, World
-from dnerf.data.viewpoints import Viewpoints, choose_up, common_focus, depths_of, find_planes, unknown_parts
+from dnerf.data.viewpoints import (
+    Viewpoints,
+    choose_up,
+    common_focus,
+    depths_of,
+    find_planes,
+    reach_around,
+    unknown_parts,
+)
 
 DIGITS = 4  # of the longest side, to which a fitted box is rounded, outwards
 DISTANCE = 4.0  # world units from the cameras to what they look at, while the box is being fitted
@@ -79,7 +87,8 @@ def _fitted(
 ) -> tuple[Similarity, Box]:
     """The similarity and the box that images, points or cameras ask for, whatever box is given.
 
-    Silhouettes say themselves where the scene ends; given planes only cut it off. Otherwise they say it.
+    Silhouettes say themselves where the scene ends; given planes only cut it off. Otherwise they say it. Cameras that
+    go around something are amid what lies farther than that: the box is for what they go around.
     """
     near, far = _first_planes(views, focus, given)
     middle = (views.positions + 0.5 * (near + far) * views.forward).median(0).values if focus is None else focus
@@ -87,6 +96,8 @@ def _fitted(
     rough = Similarity(2 * DISTANCE / (near + far), upright(up), (x, y, z))
     frames = make_frames(rough.poses_to_world(poses).float(), (near * rough.scale, far * rough.scale))
     if not frames.is_transparent and background_color(frames) is None:
+        if focus is not None:
+            far = min(far, reach_around(views, focus))
         near = near if given.near is None else given.near
         far = far if given.far is None else given.far
         near, far = (near, far) if near < far else (near, 3 * near) if given.far is None else (far / 3, far)

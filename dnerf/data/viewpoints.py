@@ -18,6 +18,7 @@ SAME_AXIS = math.cos(math.radians(0.1))
 PARALLEL = 1e-4  # share of view axes across their common direction, below which they meet nowhere
 IN_FRONT = 0.8  # share of the cameras that have what they look at in front of them
 DEPTHS = (0.5, 1.5)  # planes in terms of the depth that cameras look at
+AROUND = 0.5  # of the depth that cameras look at: how far apart cameras stand that go around it
 OF_POINTS = (0.8, 1.2)  # planes in terms of the depths of sparse points
 QUANTILE = 0.01  # of those depths, at either end, that may be wrong
 GUESSED = (0.5, 10.0)  # planes in terms of how far apart cameras stand, where they look side by side or outwards
@@ -136,6 +137,17 @@ def find_planes(views: Viewpoints, points: Tensor | None) -> tuple[float, float,
     # One viewpoint fits a scene of any size.
     depth = origin or 1.0
     return DEPTHS[0] * depth, DEPTHS[1] * depth, "arbitrary: one viewpoint does not tell how far anything is"
+
+
+def reach_around(views: Viewpoints, focus: Tensor) -> float:
+    """The z-depth up to which cameras show what they go around, in their units; infinite for cameras on one side.
+
+    Those that stand close together beside what they look at do not tell its depth well enough.
+    """
+    depths = depths_of(views, focus)
+    if views.spread < AROUND * float(depths.median()):
+        return math.inf
+    return DEPTHS[1] * float(torch.quantile(depths[depths > 0], 1 - QUANTILE))
 
 
 def _depth_of_origin(views: Viewpoints) -> float | None:

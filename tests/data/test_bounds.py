@@ -153,6 +153,11 @@ def test_sparse_points_give_their_box_with_room_and_without_the_wrong_ones() -> 
         fit_box(views(), torch.zeros(3))
 
 
+def test_sparse_points_behind_the_far_plane_do_not_widen_the_box() -> None:
+    near, behind = torch.rand(1000, 3), torch.rand(3000, 3) + torch.tensor([0.0, 0.0, -30.0])
+    torch.testing.assert_close(fit_box(views(), torch.cat([near, behind])), fit_box(views(), near))
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**31))
 def test_the_share_of_views_is_that_of_rays_that_pass(seed: int) -> None:

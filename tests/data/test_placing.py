@@ -176,3 +176,14 @@ def test_planes_of_the_files_that_cameras_do_not_look_at_are_left_alone(plain: P
     move(root, 50.0)
     edit(root, lambda top: top.update(near=2.0, far=6.0))
     assert FolderData(root).world().box == FolderData(plain).world().box
+
+
+def test_the_box_of_cameras_amid_things_is_around_what_they_go_around_however_far_the_files_see(root: Path) -> None:
+    """Images that show something everywhere; a given far plane still says where the box ends."""
+    for path in (root / "train").glob("*.png"):
+        Image.fromarray(torch.randint(0, 256, (32, 32, 3), dtype=torch.uint8).numpy()).save(path)
+    edit(root, lambda top: top.update(near=0.1, far=60.0))
+    worlds = [FolderData(root, far=far).world() for far in (None, 60.0)]
+    found, given = (2.5 / world.similarity.scale for world in worlds)
+    assert found < 12
+    assert given > 40

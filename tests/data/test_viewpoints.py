@@ -9,7 +9,15 @@ from torch import Tensor
 from dnerf.core.cameras import Intrinsics, look_at
 from dnerf.core.geometry import so3_exp
 from dnerf.data.synthetic import random_views
-from dnerf.data.viewpoints import Viewpoints, choose_up, common_focus, find_planes, measured_up, unknown_parts
+from dnerf.data.viewpoints import (
+    Viewpoints,
+    choose_up,
+    common_focus,
+    find_planes,
+    measured_up,
+    reach_around,
+    unknown_parts,
+)
 
 LENS = Intrinsics.from_angle(40, 30, 0.7)
 TURN = so3_exp(torch.tensor([1.1, -0.4, 0.3], dtype=torch.float64))
@@ -81,6 +89,18 @@ def test_cameras_side_by_side_or_looking_outwards_have_no_focus() -> None:
     for poses in (rows, outwards.double()):
         assert common_focus(views(poses)) is None
         assert "guessed" in find_planes(views(poses), None)[2]
+
+
+def test_cameras_that_go_around_something_reach_half_as_far_again_in_any_units() -> None:
+    for poses in (moved(around()), moved(arc(20, 120))):
+        own = views(poses)
+        assert reach_around(own, common_focus(own)) == pytest.approx(1.5 * 50 * 4, rel=0.05)
+
+
+def test_cameras_on_one_side_reach_as_far_as_anything_lies() -> None:
+    """Their axes cross at a small angle: a little noise moves the focus much."""
+    own = views(arc(20, 20))
+    assert reach_around(own, common_focus(own)) == math.inf
 
 
 def test_an_off_centre_crop_is_looked_at_within_its_image() -> None:
