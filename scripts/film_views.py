@@ -21,7 +21,6 @@ from dnerf.visualization import (
     make_views,
     pose_around,
     read_key_frames,
-    read_nerfstudio_path,
     spiral_path,
 )
 
@@ -31,15 +30,14 @@ ROUNDING = 1e-6  # of the clock, beyond either end of what there is
 def film_views(config: DictConfig, scene: SceneRecord, device: torch.device) -> list[View]:
     """Views of the path that the settings describe; what they leave open follows the training cameras.
 
-    Lengths in the settings are in the data set's own units, and so are the files of key frames and camera paths.
+    Lengths in the settings are in the data set's own units, and so are files of key frames.
 
     Raises:
         ValueError: naming the setting, or the file and its entry.
     """
     name = config.path.name
     makers = {
-        "keyframes": _key_frames, "nerfstudio": _nerfstudio, "test": _own_cameras, "fixed": _fixed, "orbit": _around,
-        "spiral": _around,
+        "keyframes": _key_frames, "test": _own_cameras, "fixed": _fixed, "orbit": _around, "spiral": _around,
     }  # fmt: skip
     check_choice("path.name", name, tuple(makers))
     poses, lenses, own_times = makers[name](config, scene)
@@ -120,17 +118,6 @@ def _key_frames(config: DictConfig, scene: SceneRecord) -> Path:
         for angle in angles
     ]
     return poses, lenses, times if "time" in keys.channels else None
-
-
-def _nerfstudio(config: DictConfig, scene: SceneRecord) -> Path:
-    path = read_nerfstudio_path(config.path.file, config.path.transforms)
-    if isinstance(config.resolution, ListConfig):
-        width, height = config.resolution
-    else:
-        width = config.resolution or _followed(config, scene).intrinsics.width
-        height = max(1, round(width / path.aspect))
-    poses = scene.world.similarity.poses_to_world(path.poses)
-    return poses, path.intrinsics(width, height), None if path.times is None else list(path.times)
 
 
 def _followed(config: DictConfig, scene: SceneRecord) -> Surroundings:

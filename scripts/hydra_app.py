@@ -32,8 +32,8 @@ WRONG_INPUT = 2
 USER_ERRORS = (ValueError, OSError, MemoryError, HydraException, OmegaConfBaseException)
 NO_MEMORY = "DefaultCPUAllocator"
 PATHS = (
-    "data.root", "data_root", "out_dir", "run", "output", "out", "table", "path.file", "path.transforms", "film",
-    "video", "images", "model", "masks",
+    "data.root", "data_root", "out_dir", "run", "output", "out", "table", "path.file", "film", "video",
+    "images", "model", "masks",
 )  # fmt: skip
 PLAIN = re.compile(r"(\.{0,2}/|[A-Za-z_])[A-Za-z0-9_./:-]*")  # no number, nothing that Hydra's grammar knows
 CONF = str(Path(__file__).resolve().parents[1] / "conf")

@@ -89,7 +89,6 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
         "path.elevation": NUMBER.or_null(), "path.azimuth": NUMBER.or_null(), "path.turns": NUMBER.or_null(),
         "path.start_angle": NUMBER.or_null(), "path.target": PLACE.or_null(),
         "path.elevations": _listed(NUMBER, "two angles", 2).or_null(), "path.file": TEXT,
-        "path.transforms": TEXT.or_null(),
     },
     "tracks": {
         "split": SPLIT, "frame": COUNT, "start": NUMBER.or_null(), "spacing": POSITIVE, "every": POSITIVE,

@@ -44,7 +44,6 @@ from dnerf.training.checkpoint import encode_run, max_bytes, restore_run  # noqa
 from dnerf.training.checkpoint_folder import CheckpointFolder  # noqa: E402
 from dnerf.training.runs import load_config  # noqa: E402
 from dnerf.training.tensor_files import decode, encode, load_weights, save_weights  # noqa: E402
-from dnerf.visualization import read_nerfstudio_path  # noqa: E402
 
 MAX_SECONDS = 5.0
 MAX_MEMORY = 2**30
@@ -311,16 +310,12 @@ def checkpoint(folder: Path) -> Reader:
 
 
 def record(folder: Path) -> Reader:
-    """What a run keeps of its data set, and a camera path."""
+    """What a run keeps of its data set."""
     folder.mkdir(parents=True)
     poses = torch.from_numpy(data_folders.poses()).float()
     lens = Intrinsics(8, 6, 9.5, 9.5, distortion=Distortion(radial=(0.01,)))
     world = World(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
     SceneRecord(world, {"train": CameraSet(poses, torch.zeros(4), (lens,) * 4, tuple("abcd"))}).write(folder)
-    frames = [{"camera_to_world": pose.flatten().tolist(), "fov": 50, "render_time": 0.5} for pose in poses]
-    path = {"camera_type": "perspective", "render_width": 8, "render_height": 6, "camera_path": frames}
-    (folder / "path.json").write_text(json.dumps(path))
-    (folder / "transforms.json").write_text(json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 0.5}))
     originals = {file: file.read_bytes() for file in sorted(folder.iterdir())}
 
     def read(chance: random.Random) -> None:
@@ -328,7 +323,6 @@ def record(folder: Path) -> Reader:
         file.write_bytes(spoilt(file, originals[file], chance))
         try:
             SceneRecord.read(folder)
-            read_nerfstudio_path(folder / "path.json", folder / "transforms.json")
         finally:
             file.write_bytes(originals[file])
 
