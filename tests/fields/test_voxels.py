@@ -194,10 +194,10 @@ def test_a_run_is_continued_bit_by_bit_while_levels_open(tmp_path: Path) -> None
 
 
 def test_roughness_is_of_differences_between_neighbours() -> None:
-    field = filled(view_degree=0)
+    field = VoxelField(BOX, (4, 6, 40), view_degree=0).double()  # of the last level at some layers
     with torch.no_grad():
-        for table, cells in zip(field.tables, CELLS, strict=True):
-            x, y, z = torch.tensor(rows_of(cells), dtype=torch.float64).T
+        for table, levels in zip(field.tables, field.levels, strict=True):
+            x, y, z = torch.tensor(rows_of(tuple(levels.cells)), dtype=torch.float64).T
             table.copy_((0.5 * x - 2 * y + 3 * z)[:, None].expand(-1, 4))
     in_space, in_time = field.roughness()
     assert float(in_space.detach()) == pytest.approx(3 * (0.25 + 4 + 9))
