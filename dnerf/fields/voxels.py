@@ -13,13 +13,12 @@ from dnerf.core.spherical_harmonics import check_degree, spherical_harmonics
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import HasRoughness, RadianceField, TimeDependence
+from dnerf.fields.grid import VIEW_SCALE
 from dnerf.kernels import GridLevels, grid_encode
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
 COPIES = 4  # of each number in training: the weight, its gradient, Adam's two moments
-# Of harmonics beside the constant, which stays one: this makes them orthonormal. All coefficients take steps of one
-# size, and a colour's dependence on direction is best found more slowly than the colour.
-VIEW_SCALE = 1 / math.sqrt(4 * math.pi)
+LAYERS = 16  # of a table that roughness looks at: at all of 256 cells each way, it takes as long as fifty steps
 
 
 class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Scheduled):
@@ -34,6 +33,8 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
     Source: Plenoxels (arXiv 2112.05131), sections 3.1 to 3.3. Deviations: levels are summed up where theirs are
     resampled; activations other than the ReLU, which gives no gradient where it is zero; empty space is left out by the
     sampler's occupied cells, not by a sparse table; harmonics beside the constant are kept in coarse levels only.
+
+    Adam's step touches every number, so most of a step's time goes there and not to the samples: large batches pay.
 
     Args:
         box: (2, 3) corners of the modelled space; positions outside see the nearest face.
@@ -53,19 +54,19 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
     def __init__(
         self, box: Sequence[Sequence[float]], resolutions: Sequence[int] = (32, 64, 128, 256), *, view_degree: int = 2,
         view_resolution: int = 64, density_activation: str = "exp", density_shift: float = -1.0,
-        density_scale: float = 4.0, fine_scale: float = 1.0, window_end: float | None = None, max_gib: float = 4.0,
+        density_scale: float = 4.0, window_end: float | None = None, max_gib: float = 4.0,
     ) -> None:  # fmt: skip
         super().__init__()
         check_degree("view_degree", view_degree)
         for name, value in (("view_resolution", view_resolution), *(("resolutions", r) for r in resolutions)):
             check_whole(name, value)
-        for name, value in (("density_scale", density_scale), ("fine_scale", fine_scale), ("max_gib", max_gib)):
-            check_positive(name, value)
+        check_positive("density_scale", density_scale)
+        check_positive("max_gib", max_gib)
         if not resolutions or list(resolutions) != sorted(set(resolutions)):
             raise ValueError(f"resolutions must ascend, one level at least, got {list(resolutions)}")
         if view_degree and view_resolution < resolutions[0]:
             raise ValueError(
-                f"view_resolution must be {resolutions[0]}, the first level's, at least, got {view_resolution}"
+                f"view_resolution must be {resolutions[0]}, the first level's, or more, got {view_resolution}"
             )
         if window_end is not None and not 0 < window_end <= 1:
             raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
@@ -85,7 +86,6 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         self.levels = tuple(GridLevels([c], 1 << (n - 1).bit_length()) for c, n in zip(cells, rows, strict=True))
         self.density_activation, self.density_shift = density_activation, density_shift
         self.density_scale = density_scale
-        self.shares = [fine_scale**number for number in range(len(rows))]
         self.window_end = window_end
         self.window = nn.Buffer(torch.ones(len(rows)), persistent=window_end is not None)
         self.num_open = len(rows)  # levels that are evaluated; the others' window is zero
@@ -117,7 +117,7 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         """Values (N, F) at places (N, 3) of the unit cube: of all open levels, each times its share."""
         total: Tensor | None = None
         for number, (table, levels) in enumerate(zip(tables[: self.num_open], self.levels)):
-            values = grid_encode(unit, table, levels) * self.shares[number]
+            values = grid_encode(unit, table, levels)
             if self.window_end is not None:
                 values = values * self.window[number].to(values.dtype)
             total = values if total is None else total + values
@@ -150,11 +150,17 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         return FieldOutput(density.reshape(times.shape), torch.sigmoid(colors).reshape(positions.shape))
 
     def roughness(self) -> tuple[Tensor, Tensor]:
-        """Mean squared differences of neighbours of all open tables, and zero: nothing changes with time."""
+        """Mean squared differences of neighbours, of all open tables, and zero: nothing changes with time.
+
+        Of large tables at some neighbouring layers, others at every call, drawn from torch's own generator.
+        """
         total = self.low.new_zeros(())
         for tables in (self.tables, self.harmonics):
             for table, levels in zip(tables[: self.num_open], self.levels):
                 x, y, z = levels.cells
-                values = table.view(z + 1, y + 1, x + 1, -1)
+                count = min(LAYERS, z + 1)
+                first = (torch.rand((), device=table.device) * (z + 2 - count)).long()
+                layers = first + torch.arange(count, device=table.device)
+                values = table.view(z + 1, y + 1, x + 1, -1).index_select(0, layers)
                 total = total + sum(values.diff(dim=axis).square().mean() for axis in range(3))
         return total, torch.zeros_like(total)
