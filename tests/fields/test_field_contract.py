@@ -10,17 +10,10 @@ from torch import Tensor
 
 from dnerf.core.compositing import FieldOutput
 from dnerf.deformations import DisplacementDeformation, IdentityDeformation
-from dnerf.fields import (
-    AmbientCoordinates,
-    DeformedField,
-    GridField,
-    NeRFField,
-    PlaneFeatures,
-    PlanesField,
-    RadianceField,
-    SpaceTimeVolumes,
-)
+from dnerf.fields import DeformedField, GridField, NeRFField, RadianceField, SpaceTimeVolumes
+from dnerf.fields.ambient import AmbientCoordinates
 from dnerf.fields.base import TimeDependence, field_at_time
+from dnerf.fields.planes import PlaneFeatures, PlanesField
 
 
 @dataclass(frozen=True)
