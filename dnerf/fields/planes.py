@@ -70,10 +70,7 @@ class PlanesField(HeadedField):
 
     Args:
         planes: features of places and times.
-        hidden_features, ..., window_end: of the head, see `HeadedField`.
-
-    Raises:
-        ValueError: for sizes out of range.
+        hidden_features, ..., window_end: of the head, and errors: see `HeadedField`.
     """
 
     def __init__(
