@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dnerf.core.checks import check_shape
-from dnerf.core.quadrature import optical_depths, spread_weights
+from dnerf.core.quadrature import OPAQUE, optical_depths, spread_weights
 from dnerf.core.rays import Samples
 from dnerf.kernels import packed_sum, packed_weights
 
@@ -143,7 +143,8 @@ def composite(
     """
     check_shape("density", output.density, samples.starts.shape)
     check_shape("rgb", output.rgb, (*samples.starts.shape, 3))
-    depths, shares = optical_depths(_at_least_float32(output.density), samples, quadrature)
+    density = torch.full_like(output.density, OPAQUE) if samples.is_opaque else output.density
+    depths, shares = optical_depths(_at_least_float32(density), samples, quadrature)
     weights = render_weights(depths, samples)
     if shares is not None:
         weights = spread_weights(weights, shares, samples)

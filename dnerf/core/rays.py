@@ -68,6 +68,7 @@ class Samples:
     ray_offsets: Tensor | None = None  # packed only, (R + 1,) int64; derived from `ray_indices` if None
     is_placed: Tensor | None = None  # (R,) bool, the rays that found some of a fixed number of places; None for all
     wanted: Tensor | None = None  # (2,) int64, how many of these places intervals and samples would have filled
+    is_opaque: bool = False  # whether what has a length is opaque, whatever its density: surfaces that were found
     proposals: "tuple[tuple[Samples, FieldOutput], ...]" = ()  # earlier passes that placed these; losses read them
     bounds: tuple[Tensor, ...] = ()  # what proposals without colours allow as weights, laid out like starts; see losses
 

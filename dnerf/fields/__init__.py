@@ -14,12 +14,15 @@ from dnerf.fields.base import (
 from dnerf.fields.deformed import CachedField, DeformedField
 from dnerf.fields.grid import GridField
 from dnerf.fields.nerf import NeRFField
+from dnerf.fields.normals import NormalField, normals
 from dnerf.fields.planes import PlaneFeatures, PlanesField
+from dnerf.fields.sdf import NeuSField, SDFField, VolSDFField
 from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.fields.surroundings import SurroundingsBackground
 
 __all__ = [
     "AmbientCoordinates", "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware",
-    "NeRFField", "NetworkTabled", "PlaneFeatures", "PlanesField", "RadianceField", "SignedDistance",
-    "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence", "evaluate_along_rays",
+    "NeRFField", "NetworkTabled", "NeuSField", "NormalField", "PlaneFeatures", "PlanesField", "RadianceField",
+    "SDFField", "SignedDistance", "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence",
+    "VolSDFField", "evaluate_along_rays", "normals",
 ]  # fmt: skip

@@ -2,14 +2,15 @@
 
 import logging
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from dnerf.core.compositing import FieldOutput
-from dnerf.core.rays import Rays
+from dnerf.core.rays import Rays, Samples
 from dnerf.core.shortcuts import speaks_for
 from dnerf.kernels import FrameTables, GridLevels, MarchGrid
 
@@ -53,6 +54,11 @@ class TimeDependence(ABC):
 class IntervalAware(ABC):
     """A field that knows its mean density over an interval better than from one point within it."""
 
+    @property
+    def knows_intervals(self) -> bool:
+        """Whether it does: a field around another one does if that one does."""
+        return True
+
     @abstractmethod
     def between(self, starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Mean density (...,) over straight intervals between positions (..., 3), and rgb (..., 3) in their middle.
@@ -64,9 +70,23 @@ class IntervalAware(ABC):
 class SignedDistance(ABC):
     """A field with a surface: the zero set of a signed distance, negative inside."""
 
+    @property
+    def has_surface(self) -> bool:
+        """Whether it has one: a field around another one does if that one does."""
+        return True
+
+    @property
+    def detail(self) -> float | Tensor:
+        """Size of its finest details, in world units: a good step for differences of the distance."""
+        return 1e-3
+
     @abstractmethod
     def distance(self, positions: Tensor, times: Tensor) -> Tensor:
         """Signed distance (...,), in world units, at positions (..., 3) and times (...,), with gradients."""
+
+    def steepness(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Most (...,) by which the distance changes for each unit of length around there; 1 for a true distance."""
+        return torch.ones_like(positions[..., 0])
 
 
 class HasRoughness(ABC):
@@ -118,20 +138,98 @@ def warn_of_generic_path(part: str) -> None:
     logger.warning("images take the generic path, which is slower: the fused frame kernel does not serve %s", part)
 
 
-def evaluate_along_rays(
-    field: RadianceField, rays: Rays, ray_indices: Tensor, distances: Tensor, *, pad_to: int = PAD_TO
-) -> FieldOutput:
-    """Density (N,) and rgb (N, 3) of a field at distances (N,) along the rays with numbers (N,) int64, without extras.
+def interval_aware(field: RadianceField) -> IntervalAware | None:
+    """The field as one that knows intervals, if it does; not if a subclass has another `forward` or `density`."""
+    if not isinstance(field, IntervalAware) or not speaks_for(field, "between", "forward", "density"):
+        return None
+    return field if field.knows_intervals else None
+
+
+def surface_of(field: RadianceField) -> SignedDistance | None:
+    """The field as one that has a surface, if it has one."""
+    return field if isinstance(field, SignedDistance) and field.has_surface else None
+
+
+class Ends(NamedTuple):
+    """Ends of intervals one after the other; what one interval's end and the next one's start share is there once."""
+
+    positions: Tensor  # (M, 3)
+    directions: Tensor  # (M, 3)
+    times: Tensor  # (M,)
+    last: Tensor  # (...,) int64, where the end of each interval is; its start is the one before
+
+    def pairs(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (..., n) at the start and the end of each interval, of values (M, n) at all ends."""
+        number = self.last.reshape(-1)
+        first, last = (values.index_select(0, i).unflatten(0, self.last.shape) for i in (number - 1, number))
+        return first, last
+
+
+def ends_of(starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> Ends:
+    """Ends of intervals between positions (..., 3), for fields that are evaluated at both, see `IntervalAware`.
+
+    Intervals that touch share an end, bit by bit: it is evaluated once. On a GPU, which would have to wait for their
+    number, all are evaluated.
+    """
+    first, last = (
+        torch.cat([x, directions, times[..., None].to(x.dtype)], dim=-1).reshape(-1, 7) for x in (starts, ends)
+    )
+    number = torch.arange(len(first), device=first.device)
+    is_new = torch.ones_like(number, dtype=torch.bool)
+    if first.is_cpu:
+        is_new[1:] = (first[1:] != last[:-1]).any(-1)
+    place = number + is_new.cumsum(0)
+    count = 2 * len(first) if not first.is_cpu else int(place[-1]) + 1 if len(place) else 0
+    source = number.new_empty(count)
+    source[place - 1] = number
+    source[place] = number + len(first)
+    rows = torch.cat([first, last]).index_select(0, source)
+    return Ends(rows[:, :3], rows[:, 3:6], rows[:, 6].to(times.dtype), place.reshape(times.shape))
+
+
+def evaluate_samples(field: RadianceField, samples: Samples, rays: Rays) -> tuple[FieldOutput, Tensor, Tensor]:
+    """What a field says of samples of R rays, and their positions (..., 3) and times (...,), laid out like them.
+
+    Fields that know intervals are evaluated between their ends, unless samples are opaque, see `Samples`.
+    """
+    positions, directions, times = samples.locate(rays)
+    aware = None if samples.is_opaque else interval_aware(field)
+    if aware is None:
+        return field(positions, directions, times), positions, times
+    starts, ends = (replace(samples, points=x).locate(rays)[0] for x in (samples.starts, samples.ends))
+    return aware.between(starts, ends, directions, times), positions, times
+
+
+def density_of_samples(field: RadianceField, samples: Samples, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+    """The density (...,) of samples of R rays alone, and their positions and times, see `evaluate_samples`.
+
+    Density at points bounds that of an interval for a surface crossed at an angle: it would hide what is behind.
+    """
+    if interval_aware(field) is not None:
+        output, positions, times = evaluate_samples(field, samples, rays)
+        return output.density, positions, times
+    positions, _, times = samples.locate(rays)
+    return field.density(positions, times), positions, times
+
+
+def evaluate_along_rays(field: RadianceField, rays: Rays, samples: Samples, *, pad_to: int = PAD_TO) -> FieldOutput:
+    """Density (N,) and rgb (N, 3) of a field at packed samples (N,) of rays, without extras.
 
     At most `MOST_AT_ONCE` places at a time; a multiple of `pad_to` is evaluated.
     """
-    count = len(distances)
+    aware = interval_aware(field)
+    columns = [samples.ray_indices, *((samples.distances,) if aware is None else (samples.starts, samples.ends))]
+    count = len(samples.starts)
     padding = -count % pad_to if count else 0
     if padding:
-        ray_indices, distances = (torch.cat([x, x[-1:].expand(padding)]) for x in (ray_indices, distances))
-    parts = [
-        field(*rays.places(*part))
-        for part in zip(ray_indices.split(MOST_AT_ONCE), distances.split(MOST_AT_ONCE), strict=True)
-    ]
+        columns = [torch.cat([x, x[-1:].expand(padding)]) for x in columns]
+
+    def evaluated(ray_indices: Tensor, first: Tensor, *last: Tensor) -> FieldOutput:
+        positions, directions, times = rays.places(ray_indices, first)
+        if aware is None:
+            return field(positions, directions, times)
+        return aware.between(positions, rays.places(ray_indices, *last)[0], directions, times)
+
+    parts = [evaluated(*part) for part in zip(*(x.split(MOST_AT_ONCE) for x in columns), strict=True)]
     density, rgb = (torch.cat(x) if len(x) > 1 else x[0] for x in zip(*((p.density, p.rgb) for p in parts)))
     return FieldOutput(density[:count], rgb[:count])

@@ -8,23 +8,30 @@ from torch import Tensor
 from dnerf.core.compositing import FieldOutput
 from dnerf.core.shortcuts import speaks_for
 from dnerf.deformations import CachedAtTime, Deformation
-from dnerf.deformations.base import deformation_at_time
+from dnerf.deformations.base import deformation_at_time, unwrapped
+from dnerf.deformations.jacobian import largest_stretch
 from dnerf.fields.base import (
     FrameTabled,
+    IntervalAware,
     NetworkTabled,
     NetworkTables,
     RadianceField,
+    SignedDistance,
+    ends_of,
     field_at_time,
+    interval_aware,
+    surface_of,
     warn_of_generic_path,
 )
 from dnerf.kernels import FrameTables, MarchGrid, is_bfloat16_wanted, is_traced
 
 
-class DeformedField(RadianceField):
+class DeformedField(RadianceField, IntervalAware, SignedDistance):
     """The canonical field at deformed positions: (density, rgb)(x, d, t) = canonical(deformation(x, t), d, t).
 
     Viewing directions are not turned by the deformation (as in D-NeRF). Its output carries the extras
-    "canonical_positions" (..., 3), "positions" (..., 3) and "times" (...,) as they came.
+    "canonical_positions" (..., 3), "positions" (..., 3) and "times" (...,) as they came. It knows intervals and has a
+    surface if the canonical field does; its distance is the canonical one.
 
     Args:
         deformation: world -> canonical.
@@ -46,6 +53,57 @@ class DeformedField(RadianceField):
         output = self.canonical(canonical_positions, directions, times)
         extras = {"canonical_positions": canonical_positions, "positions": positions, "times": times}
         return replace(output, extras={**output.extras, **extras})
+
+    @property
+    def knows_intervals(self) -> bool:
+        """Whether the canonical field does."""
+        return interval_aware(self.canonical) is not None
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether the canonical field has one."""
+        return surface_of(self.canonical) is not None
+
+    @property
+    def detail(self) -> float | Tensor:
+        """That of the canonical field."""
+        return self._surface.detail
+
+    @property
+    def _surface(self) -> SignedDistance:
+        surface = surface_of(self.canonical)
+        if surface is None:
+            raise ValueError(f"canonical must be a field with a signed distance, got {type(self.canonical).__name__}")
+        return surface
+
+    def distance(self, positions: Tensor, times: Tensor) -> Tensor:
+        """The canonical field's distance (...,) at positions (..., 3), which need not lie on rays, and times (...,)."""
+        return self._surface.distance(unwrapped(self.deformation)(positions, times), times)
+
+    def steepness(self, positions: Tensor, times: Tensor) -> Tensor:
+        """The canonical field's, times the largest stretch of the deformation."""
+        deformation = unwrapped(self.deformation)
+        canonical = self._surface.steepness(deformation(positions, times), times)
+        return canonical * largest_stretch(deformation, positions, times)
+
+    def between(self, starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        """What the canonical field says of the straight interval between where both ends go, per unit of length here.
+
+        The extra "canonical_positions" is the middle of that interval.
+        """
+        canonical = interval_aware(self.canonical)
+        if canonical is None:
+            raise ValueError(f"canonical must be a field that knows intervals, got {type(self.canonical).__name__}")
+        all_ends = ends_of(starts, ends, directions, times)
+        first, last = all_ends.pairs(self.deformation(all_ends.positions, all_ends.times))
+        output = canonical.between(first, last, directions, times)
+        length = (ends - starts).norm(dim=-1)
+        is_long = length > 0
+        share = (last - first).norm(dim=-1) / torch.where(is_long, length, 1)
+        extras = {"canonical_positions": 0.5 * (first + last), "positions": 0.5 * (starts + ends), "times": times}
+        return FieldOutput(
+            torch.where(is_long, output.density * share, output.density), output.rgb, {**output.extras, **extras}
+        )
 
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
         """The same with both parts at that time."""

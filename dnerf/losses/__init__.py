@@ -5,8 +5,9 @@ from dnerf.losses.deformation import AppearanceConstancyLoss, ElasticLoss, Jacob
 from dnerf.losses.histogram import HistogramLoss
 from dnerf.losses.photometric import PhotometricLoss
 from dnerf.losses.regularizers import SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
+from dnerf.losses.surfaces import EikonalLoss
 
 __all__ = [
-    "AppearanceConstancyLoss", "Batch", "ElasticLoss", "HistogramLoss", "JacobianDeterminantLoss",
+    "AppearanceConstancyLoss", "Batch", "EikonalLoss", "ElasticLoss", "HistogramLoss", "JacobianDeterminantLoss",
     "Loss", "PhotometricLoss", "RestLoss", "SmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss", "VolumeLoss",
 ]  # fmt: skip

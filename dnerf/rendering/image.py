@@ -113,7 +113,7 @@ def _without_gradients(
             samples = sampler(rays, field)
         if not samples.is_packed:
             return renderer.render_samples(rays, samples, field)
-        if not renderer.ends_early:
+        if not renderer.ends_early or samples.is_opaque:
             return renderer.render_samples(rays, samples.padded(PAD_TO), field)
         source: Source = (packed := PackedRounds(samples))
         numbers = packed.rays
@@ -126,8 +126,7 @@ def _without_gradients(
             if marcher is not None:
                 part, output = marcher.refined(part, chosen, field, transmittance, renderer.stop_transmittance)
             else:
-                assert part.ray_indices is not None
-                output = evaluate_along_rays(field, chosen, part.ray_indices, part.distances)
+                output = evaluate_along_rays(field, chosen, part)
         return add_seen(
             sums, ray_numbers, transmittance, part.starts, part.ends, part.offsets, output.density, output.rgb,
             part.points,

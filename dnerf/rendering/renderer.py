@@ -14,7 +14,7 @@ from dnerf.core.quadrature import check_rule
 from dnerf.core.rays import Rays, Samples
 from dnerf.core.schedules import Scheduled
 from dnerf.core.shortcuts import speaks_for
-from dnerf.fields.base import RadianceField
+from dnerf.fields.base import RadianceField, evaluate_samples
 from dnerf.rendering.frame_graphs import FrameGraphs
 from dnerf.rendering.image import image_columns
 from dnerf.samplers.base import Capacity, FixedCapacity, Sampler
@@ -102,8 +102,7 @@ class Renderer(nn.Module):
     ) -> Rendering:
         """Evaluate a field at samples of R rays, dense or packed, and composite."""
         with self.autocast(rays.origins.device):
-            positions, directions, times = samples.locate(rays)
-            output = field(positions, directions, times)
+            output, positions, times = evaluate_samples(field, samples, rays)
         if self.training:
             density = torch.where(samples.lengths > 0, output.density.detach(), 0)  # of padding: nothing
             self.sampler.observe(positions.detach(), times, density)

@@ -13,7 +13,7 @@ from dnerf.core.fixed_size import placed
 from dnerf.core.quadrature import interval_depths
 from dnerf.core.rays import Rays, Samples
 from dnerf.core.schedules import Schedule, Scheduled, at
-from dnerf.fields.base import RadianceField, evaluate_along_rays
+from dnerf.fields.base import RadianceField, density_of_samples, evaluate_along_rays, interval_aware
 from dnerf.kernels import MarchGrid, footprints, march, march_to_size, seen_parts
 from dnerf.samplers.base import Capacity, FixedCapacity, FrontToBack, OccupancyAware, OccupiedCells, Sampler
 from dnerf.samplers.occupancy_grid import OccupancyGrid
@@ -148,8 +148,7 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
 
         What is known is not evaluated again: whole intervals, and parts in whose middle their interval's is.
         """
-        assert samples.ray_indices is not None
-        known = evaluate_along_rays(field, rays, samples.ray_indices, samples.distances, pad_to=self.pad_to)
+        known = evaluate_along_rays(field, rays, samples, pad_to=self.pad_to)
         if self.render_subdivision == 1:
             return samples, known
         parts = seen_parts(
@@ -160,10 +159,12 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
             parts.starts, parts.ends, len(rays), ray_indices=parts.ray_indices, ray_offsets=parts.offsets
         )
         density, rgb = (x.index_select(0, parts.whole) for x in (known.density, known.rgb))
-        if len(parts.new):
-            numbers, distances = (x.index_select(0, parts.new) for x in (parts.ray_indices, placed_parts.distances))
-            found = evaluate_along_rays(field, rays, numbers, distances, pad_to=self.pad_to)
-            density[parts.new], rgb[parts.new] = found.density, found.rgb
+        new = parts.new
+        if interval_aware(field) is not None:  # the middle of an interval says nothing of the part in its middle
+            new = (parts.whole.bincount()[parts.whole] > 1).nonzero()[:, 0]
+        if len(new):
+            found = evaluate_along_rays(field, rays, placed_parts.chosen(new), pad_to=self.pad_to)
+            density[new], rgb[new] = found.density, found.rgb
         return placed_parts, FieldOutput(density, rgb)
 
     def path_key(self) -> Hashable:
@@ -186,8 +187,7 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
             intervals.starts, intervals.ends, len(rays), ray_indices=intervals.ray_indices,
             ray_offsets=intervals.offsets, is_placed=placed(intervals.ray_indices, is_filled, len(rays), num_marched),
         )  # fmt: skip
-        positions, _, times = samples.locate(rays)
-        density = field.density(positions, times)
+        density, positions, times = density_of_samples(field, samples, rays)
         if self.training:
             self.observe(positions, times, torch.where(is_filled, density, 0))
         weights = render_weights(interval_depths(density, samples.lengths), samples)

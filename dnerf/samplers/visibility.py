@@ -8,7 +8,7 @@ from torch import Tensor
 from dnerf.core.compositing import render_weights, sum_along_rays
 from dnerf.core.quadrature import interval_depths
 from dnerf.core.rays import Rays, Samples
-from dnerf.fields.base import RadianceField
+from dnerf.fields.base import RadianceField, density_of_samples
 
 Source = Callable[[Tensor, int, int], tuple[Samples, Tensor]]
 Visitor = Callable[[Tensor, Samples, Tensor], Tensor]
@@ -100,8 +100,7 @@ def visible_weights(
     rounds = PackedRounds(samples, pad_to)
 
     def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
-        positions, _, times = part.locate(rays[ray_numbers])
-        density = field.density(positions, times)
+        density, positions, times = density_of_samples(field, part, rays[ray_numbers])
         if observe is not None:
             observe(positions, times, density)
         optical_depth = interval_depths(density, part.lengths)
