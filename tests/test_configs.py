@@ -68,6 +68,7 @@ CHOICES = [f"{group}={name}" for group in GROUPS for name in names(group) if (gr
 def test_config_composes_instantiates_and_takes_a_step(choice: str) -> None:
     """With one loss, which needs nothing of the model, unless the choice brings its own."""
     alone = () if choice.startswith("experiment=") else ("trainer/losses=rgb",)
+    alone = (*alone, "field=sdf") if choice == "sampler=sphere_tracing" else alone
     data, renderer, trainer = parts(*TINY, "~trainer.callbacks", *alone, choice)
     before = [p.detach().clone() for p in renderer.parameters()]
     assert trainer.fit(renderer, data.frames("train")).step == 2
@@ -78,7 +79,10 @@ def test_every_loss_joins_the_flow() -> None:
     added = ("field=grid_space_time", "+trainer/losses=[smoothness,rest]")
     changes = (*added, *TINY, "~trainer.callbacks", "trainer.num_steps=4")
     data, renderer, trainer = parts("experiment=flow", *changes)
-    assert set(trainer.losses) == set(names("trainer/losses")) - {"histogram"}  # see experiment=proposal
+    assert set(trainer.losses) == set(names("trainer/losses")) - {
+        "eikonal",
+        "histogram",
+    }  # see experiment=sdf and proposal
     record = trainer.fit(renderer, data.frames("train"))
     assert set(record.losses) == {"loss", *trainer.losses}  # all of them have their turn in every fourth step
 

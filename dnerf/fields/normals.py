@@ -8,6 +8,8 @@ from dnerf.core.geometry import safe_normalize
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.base import IntervalAware, RadianceField, field_at_time, interval_aware, surface_of
 
+FAINT = 1e-3  # opacity, up to which the direction of what an image shows is rounding
+
 
 def normals(field: RadianceField, positions: Tensor, times: Tensor) -> Tensor:
     """Unit normals (..., 3), outwards, at positions (..., 3) and times (...,); zero where the field is level.
@@ -73,5 +75,5 @@ class NormalField(RadianceField, IntervalAware):
 
 
 def normals_of_image(rgb: Tensor, opacity: Tensor) -> Tensor:
-    """Unit normals (..., 3), zero where nothing is, of what a `NormalField` shows before black: rgb, opacity (...,)."""
-    return safe_normalize(2 * rgb - opacity[..., None])
+    """Unit normals (..., 3) of what a `NormalField` shows before black, rgb and opacity (...,); zero if faint."""
+    return torch.where(opacity[..., None] > FAINT, safe_normalize(2 * rgb - opacity[..., None]), 0)

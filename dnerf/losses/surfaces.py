@@ -8,7 +8,6 @@ from torch import Tensor, nn
 from dnerf.core.checks import as_box, check_positive, check_whole
 from dnerf.core.compositing import Rendering
 from dnerf.core.schedules import Schedule
-from dnerf.fields import DeformedField
 from dnerf.fields.base import RadianceField, SignedDistance, surface_of
 from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import spread_numbers
@@ -19,9 +18,8 @@ PLASTIC = 1.2207440846057596  # root of x^4 = x + 1: Kronecker's sequence in thr
 
 def canonical_surface(field: RadianceField) -> SignedDistance | None:
     """What has a surface in canonical space, behind all deformations; None if nothing has."""
-    while isinstance(field, DeformedField):
-        field = field.canonical
-    return surface_of(field)
+    surfaces = [part for part in field.modules() if isinstance(part, RadianceField) and surface_of(part)]
+    return surface_of(surfaces[-1]) if surfaces else None  # parts come after what they are part of
 
 
 class EikonalLoss(Loss):

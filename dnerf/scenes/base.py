@@ -10,12 +10,15 @@ from torch import Tensor
 from dnerf.core.checks import as_box, check_batch, check_positive, check_shape
 from dnerf.core.compositing import FieldOutput, safe_divide
 from dnerf.core.rays import Rays, Samples
-from dnerf.fields.base import RadianceField
+from dnerf.fields.base import RadianceField, SignedDistance
 from dnerf.scenes.motions import Fixed, Motion, world_poses
 from dnerf.scenes.poses import Pose
 from dnerf.scenes.quadrature import MAX_DEPTH, absorption_rule
 from dnerf.scenes.shapes import Shape
 from dnerf.scenes.textures import Texture
+
+FAR = 1e3
+"""Distance from a body that is not there, in world units."""
 
 NUM_NODES = {torch.float32: 6, torch.float64: 16}
 """Gauss nodes per interval of smooth colour: enough for the rounding of each precision in the scenes here."""
@@ -63,7 +66,7 @@ class Body:
         return torch.where(hits, enter, near), torch.where(hits, leave, near)
 
 
-class AnalyticScene(RadianceField):
+class AnalyticScene(RadianceField, SignedDistance):
     """A radiance field without parameters, made of moving bodies, with exact images and exact motion.
 
     Bodies that overlap add up: densities are summed, colours are averaged by density, as light emitted by both.
@@ -106,6 +109,15 @@ class AnalyticScene(RadianceField):
         """Index (...,) int64 of the first body that holds each point, -1 in empty space."""
         inside = self.contains(positions, times)
         return torch.where(inside.any(-1), inside.to(torch.int8).argmax(dim=-1), -1)
+
+    def distance(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Signed distance (...,) of the nearest body; inside where bodies overlap, and beside bent ones, about that."""
+        check_batch("times", times, positions)
+        nearest = torch.full_like(positions[..., 0], FAR)
+        for body, pose in self.posed(times):
+            distance = pose.scale * body.shape.distance(pose.to_local(positions))
+            nearest = torch.minimum(nearest, torch.where(pose.presence > 0, distance, FAR))
+        return nearest.reshape(times.shape)
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) in 1 / world unit at positions (..., 3) and times (...,)."""

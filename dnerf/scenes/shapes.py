@@ -30,6 +30,10 @@ class Shape(ABC):
     def excess(self, points: Tensor) -> Tensor:
         """How far points (..., 3) are outside, (...,): <= 0 inside; it changes by at most 1 per unit of length."""
 
+    def distance(self, points: Tensor) -> Tensor:
+        """Signed distance (...,) from the surface of points (..., 3), negative inside."""
+        return self.excess(points)
+
     def contains(self, points: Tensor) -> Tensor:
         """Whether points (..., 3) lie inside, (...,) bool."""
         return self.excess(points) <= 0
@@ -120,6 +124,11 @@ class Box(Shape):
     def excess(self, points: Tensor) -> Tensor:
         """By how much the worst coordinate is beyond its face."""
         return (points.abs() - constant(self.half_sizes, points)).amax(-1)
+
+    def distance(self, points: Tensor) -> Tensor:
+        """By all coordinates that are beyond their faces; inside, by the nearest face."""
+        beyond = points.abs() - constant(self.half_sizes, points)
+        return beyond.clamp(min=0).norm(dim=-1) + beyond.amax(-1).clamp(max=0)
 
     def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """The slab method."""

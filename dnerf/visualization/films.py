@@ -127,6 +127,10 @@ def _images(store: FrameStore, output: str) -> Iterator[NDArray | torch.Tensor]:
         yield from (frame["rgb"] for frame in store)
     elif output == "opacity":
         yield from (np.repeat(frame["opacity"].clip(0, 1)[..., None], 3, axis=-1) for frame in store)
+    elif output == "normals":
+        for frame in store:
+            share = frame["opacity"].clip(0, 1)[..., None]
+            yield share * 0.5 * (frame["normals"] + 1) + (1 - share)
     elif output == "compare":
         for frame in store:
             prediction, truth = (torch.from_numpy(frame[name]).float() / 255 for name in ("rgb", "truth"))

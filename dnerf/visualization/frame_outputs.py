@@ -1,4 +1,4 @@
-"""One frame of a film as arrays: colour, depth, opacity, motion, deformation, truth."""
+"""One frame of a film as arrays: colour, depth, opacity, motion, deformation, normals, truth."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,9 +7,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dnerf.core.backgrounds import ConstantBackground
 from dnerf.core.cameras import Camera
 from dnerf.core.checks import check_choice, check_positive
 from dnerf.core.compositing import Rendering, safe_divide, sum_along_rays
+from dnerf.fields.normals import NormalField, normals_of_image
 from dnerf.motion import motion_model, motion_vectors
 from dnerf.rendering.renderer import Renderer
 from dnerf.visualization.video import to_uint8
@@ -22,6 +24,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "opacity": ("opacity",),
     "motion": ("motion",),
     "deformation": ("deformation", "opacity"),
+    "normals": ("normals", "opacity"),
     "compare": ("rgb", "truth"),
 }
 
@@ -62,7 +65,7 @@ def render_layers(
         distance along the ray (not the z-depth), 0 where nothing is. motion (H, W, 2) float32, pixels to
         the right and down to where the surface is in the next frame, camera motion included; NaN where there is none,
         where it is unknown or not found, and after the last frame. deformation (H, W) float32, see
-        `deformation_magnitude`.
+        `deformation_magnitude`. normals (H, W, 3) float32, see `normals_image`.
 
     Raises:
         ValueError: if an output is unknown, or needs a truth or a deformation that is not there.
@@ -85,6 +88,8 @@ def render_layers(
     if "deformation" in layers:
         moved = deformation_magnitude(renderer, view.camera, view.time, chunk=chunk) / unit
         arrays["deformation"] = moved.cpu().numpy()
+    if "normals" in layers:
+        arrays["normals"] = normals_image(renderer, view.camera, view.time, chunk=chunk).cpu().numpy()
     return arrays
 
 
@@ -114,6 +119,19 @@ def deformation_magnitude(renderer: Renderer, camera: Camera, time: float, *, ch
         for module, mode in modes:
             module.training = mode
     return torch.cat(parts).reshape(camera.intrinsics.height, camera.intrinsics.width).float()
+
+
+def normals_image(renderer: Renderer, camera: Camera, time: float, *, chunk: int = 16384) -> Tensor:
+    """Unit normals (H, W, 3) float32, in world axes, of what each pixel shows: the mean by weight, 0 where nothing is.
+
+    Raises ValueError for a field that is not differentiable to positions.
+    """
+    shown = Renderer(
+        NormalField(renderer.field), renderer.sampler, ConstantBackground("black"),
+        stop_transmittance=renderer.stop_transmittance, quadrature=renderer.quadrature,
+    )  # fmt: skip
+    rendering = shown.to(renderer.device).render_image(camera, time, chunk=chunk)
+    return normals_of_image(rendering.rgb, rendering.opacity).float()
 
 
 def _motion(renderer: Renderer, view: View, following: View | None, rendering: Rendering, chunk: int) -> NDArray:

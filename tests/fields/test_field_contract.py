@@ -15,10 +15,13 @@ from dnerf.fields import (
     DeformedField,
     GridField,
     NeRFField,
+    NeuSField,
     PlaneFeatures,
     PlanesField,
     RadianceField,
+    SDFField,
     SpaceTimeVolumes,
+    VolSDFField,
 )
 from dnerf.fields.base import TimeDependence, field_at_time
 
@@ -67,6 +70,12 @@ def small_ambient() -> GridField:
     return small_grid(space_time=ambient)
 
 
+def small_sdf(kind: type[SDFField], view_degree: int | None = None) -> SDFField:
+    box = [[-1, -1.5, -1], [1, 1.5, 2]]
+    options = {"max_rows": 64, "hidden_features": 16, "num_layers": 1, "view_degree": view_degree}
+    return kind(box, (4, 9), 2, **options, radius=0.5, width=0.3)
+
+
 FIELDS = {
     "nerf": Case(small_nerf), "nerf, exp density": Case(lambda: small_nerf(density_activation="exp")),
     "nerf, view-dependent": Case(lambda: small_nerf(view_dependent=True), view_dependent=True),
@@ -79,6 +88,8 @@ FIELDS = {
     "planes": Case(small_planes), "planes of space": Case(lambda: small_planes(None)),
     "planes, view-dependent": Case(lambda: small_planes(3, 2), True), "grid, ambient": Case(small_ambient),
     "planes in pairs": Case(lambda: small_planes(join="pairs")),
+    "sdf, NeuS": Case(lambda: small_sdf(NeuSField)), "sdf, VolSDF": Case(lambda: small_sdf(VolSDFField)),
+    "sdf, view-dependent": Case(lambda: small_sdf(NeuSField, 2), True),
     "static": Case(lambda: DeformedField(IdentityDeformation(), small_nerf())),
     "deformed": Case(lambda: DeformedField(small_displacement(), small_nerf())),
     "deformed, view-dependent": Case(lambda: DeformedField(small_displacement(), small_nerf(True)), True),

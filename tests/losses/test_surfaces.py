@@ -1,0 +1,100 @@
+"""The eikonal term: zero for true distances, and what it costs where they are not."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from dnerf.core.rays import Rays
+from dnerf.deformations import Deformation, IdentityDeformation
+from dnerf.fields import DeformedField, GridField, NeuSField, RadianceField
+from dnerf.losses import Batch, EikonalLoss
+from dnerf.losses.surfaces import canonical_surface, differences
+from dnerf.rendering.renderer import Renderer
+from dnerf.samplers import StratifiedSampler
+
+BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
+NOTHING = Batch(torch.zeros(2, 4), torch.zeros(2, 3))
+
+
+class Slope(NeuSField):
+    """A plane whose distance grows too fast, by a factor."""
+
+    factor = 1.0
+
+    def _distance(self, positions: Tensor, raw: Tensor) -> Tensor:
+        return self.factor * (0.6 * positions[..., 0] + 0.8 * positions[..., 2]) + 0 * raw
+
+
+class Stretch(Deformation):
+    """Twice as large in canonical space."""
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        return 2 * positions
+
+
+def slope(factor: float) -> Slope:
+    field = Slope(BOX, (4, 8), 2, max_rows=1024)
+    field.factor = factor
+    return field
+
+
+def term(field: RadianceField) -> Tensor:
+    z = torch.tensor([-0.1, 0.2])
+    rays = Rays(torch.tensor([[0.0, 0, 2], [0.1, 0, 2]]), torch.tensor([[0.0, 0, -1]] * 2), z.abs(), 0 * z, 4 + 0 * z)
+    model = Renderer(field, StratifiedSampler(16))
+    loss = EikonalLoss(BOX)
+    loss.check(model)
+    return loss(model(rays), NOTHING, model)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5, 3.0])
+def test_the_term_is_the_squared_deviation_of_the_slope_from_one(factor: float) -> None:
+    assert float(term(slope(factor)).detach()) == pytest.approx((factor - 1) ** 2, abs=1e-5)
+
+
+def test_it_holds_in_canonical_space() -> None:
+    for deformation in (IdentityDeformation(), Stretch()):
+        assert float(term(DeformedField(deformation, slope(1.0))).detach()) == pytest.approx(0, abs=1e-5)
+
+
+def test_differences_are_the_gradient_up_to_second_order() -> None:
+    torch.manual_seed(0)
+    field = NeuSField(BOX, (2,), 2, max_rows=1024, hidden_features=16, num_layers=1).double()
+    with torch.no_grad():
+        field.table.mul_(30)
+    x = (0.1 + 0.3 * torch.rand(50, 3, dtype=torch.float64)).requires_grad_()  # within one cell
+    (exact,) = torch.autograd.grad(field.distance(x, x[:, 0]).sum(), x)
+    # A ReLU bends in places: most are smooth.
+    errors = [(differences(field, x, x[:, 0], h) - exact).norm(dim=-1).detach().quantile(0.7) for h in (2e-3, 1e-3)]
+    assert errors[0] < 1e-4
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_minimising_it_makes_a_distance_of_what_is_none() -> None:
+    torch.manual_seed(0)
+    field = NeuSField(BOX, (4, 8), 2, max_rows=1024, hidden_features=16, num_layers=1)
+    with torch.no_grad():
+        field.table.mul_(20)
+    optimizer = torch.optim.Adam(field.parameters(), 5e-3)
+    values = []
+    for _ in range(60):
+        loss = term(DeformedField(IdentityDeformation(), field))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        values.append(float(loss.detach()))
+    assert values[-1] < 0.2 * values[0]
+    assert all(p.grad.isfinite().all() for p in field.parameters() if p.grad is not None)
+
+
+def test_a_level_distance_has_finite_gradients() -> None:
+    field = slope(0.0)
+    term(field).backward()
+    assert field.table.grad.isfinite().all()
+
+
+def test_fields_without_a_surface_are_named() -> None:
+    grid = DeformedField(IdentityDeformation(), GridField(BOX, (4,), 2, max_rows=1024))
+    assert canonical_surface(grid) is None
+    with pytest.raises(ValueError, match="EikonalLoss needs a field with a signed distance, got DeformedField"):
+        EikonalLoss(BOX).check(Renderer(grid, StratifiedSampler(8)))
