@@ -168,30 +168,23 @@ class Ends(NamedTuple):
 def ends_of(starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> Ends:
     """Ends of intervals between positions (..., 3), for fields that are evaluated at both, see `IntervalAware`.
 
-    Intervals that touch share an end, bit by bit: it is evaluated once. On a GPU, which would have to wait for their
-    number, all are evaluated.
+    Intervals that touch share an end, bit by bit; a GPU would have to wait for their number, and evaluates all.
     """
-    first, last = (
-        torch.cat([x, directions, times[..., None].to(x.dtype)], dim=-1).reshape(-1, 7) for x in (starts, ends)
-    )
-    number = torch.arange(len(first), device=first.device)
+    rows = [torch.cat([x, directions, times[..., None].to(x.dtype)], dim=-1).reshape(-1, 7) for x in (starts, ends)]
+    number = torch.arange(times.numel(), device=times.device)
     is_new = torch.ones_like(number, dtype=torch.bool)
-    if first.is_cpu:
-        is_new[1:] = (first[1:] != last[:-1]).any(-1)
+    if times.is_cpu:
+        is_new[1:] = (rows[0][1:] != rows[1][:-1]).any(-1)
     place = number + is_new.cumsum(0)
-    count = 2 * len(first) if not first.is_cpu else int(place[-1]) + 1 if len(place) else 0
-    source = number.new_empty(count)
+    source = number.new_empty(len(number) + (int(is_new.sum()) if times.is_cpu else len(number)))
     source[place - 1] = number
-    source[place] = number + len(first)
-    rows = torch.cat([first, last]).index_select(0, source)
-    return Ends(rows[:, :3], rows[:, 3:6], rows[:, 6].to(times.dtype), place.reshape(times.shape))
+    source[place] = number + len(number)
+    joined = torch.cat(rows).index_select(0, source)
+    return Ends(joined[:, :3], joined[:, 3:6], joined[:, 6].to(times.dtype), place.reshape(times.shape))
 
 
 def evaluate_samples(field: RadianceField, samples: Samples, rays: Rays) -> tuple[FieldOutput, Tensor, Tensor]:
-    """What a field says of samples of R rays, and their positions (..., 3) and times (...,), laid out like them.
-
-    Fields that know intervals are evaluated between their ends, unless samples are opaque, see `Samples`.
-    """
+    """What a field says of samples of R rays, between their ends if it knows intervals, their positions, and times."""
     positions, directions, times = samples.locate(rays)
     aware = None if samples.is_opaque else interval_aware(field)
     if aware is None:
@@ -201,11 +194,8 @@ def evaluate_samples(field: RadianceField, samples: Samples, rays: Rays) -> tupl
 
 
 def density_of_samples(field: RadianceField, samples: Samples, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """The density (...,) of samples of R rays alone, and their positions and times, see `evaluate_samples`.
-
-    Density at points bounds that of an interval for a surface crossed at an angle: it would hide what is behind.
-    """
-    if interval_aware(field) is not None:
+    """The density (...,) of samples of R rays alone, and their positions and times, see `evaluate_samples`."""
+    if interval_aware(field) is not None:  # density at points is too high at an angle, and would hide what is behind
         output, positions, times = evaluate_samples(field, samples, rays)
         return output.density, positions, times
     positions, _, times = samples.locate(rays)

@@ -64,27 +64,18 @@ class DeformedField(RadianceField, IntervalAware, SignedDistance):
         """Whether the canonical field has one."""
         return surface_of(self.canonical) is not None
 
-    @property
-    def detail(self) -> float | Tensor:
-        """That of the canonical field."""
-        return self._surface.detail
-
-    @property
-    def _surface(self) -> SignedDistance:
-        surface = surface_of(self.canonical)
-        if surface is None:
-            raise ValueError(f"canonical must be a field with a signed distance, got {type(self.canonical).__name__}")
-        return surface
-
     def distance(self, positions: Tensor, times: Tensor) -> Tensor:
         """The canonical field's distance (...,) at positions (..., 3), which need not lie on rays, and times (...,)."""
-        return self._surface.distance(unwrapped(self.deformation)(positions, times), times)
+        surface = surface_of(self.canonical)
+        assert surface is not None, "asked only if has_surface"
+        return surface.distance(unwrapped(self.deformation)(positions, times), times)
 
     def steepness(self, positions: Tensor, times: Tensor) -> Tensor:
         """The canonical field's, times the largest stretch of the deformation."""
-        deformation = unwrapped(self.deformation)
-        canonical = self._surface.steepness(deformation(positions, times), times)
-        return canonical * largest_stretch(deformation, positions, times)
+        surface, deformation = surface_of(self.canonical), unwrapped(self.deformation)
+        assert surface is not None, "asked only if has_surface"
+        stretch = largest_stretch(deformation, positions, times)
+        return stretch * surface.steepness(deformation(positions, times), times)
 
     def between(self, starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """What the canonical field says of the straight interval between where both ends go, per unit of length here.
@@ -92,18 +83,15 @@ class DeformedField(RadianceField, IntervalAware, SignedDistance):
         The extra "canonical_positions" is the middle of that interval.
         """
         canonical = interval_aware(self.canonical)
-        if canonical is None:
-            raise ValueError(f"canonical must be a field that knows intervals, got {type(self.canonical).__name__}")
+        assert canonical is not None, "asked only if knows_intervals"
         all_ends = ends_of(starts, ends, directions, times)
         first, last = all_ends.pairs(self.deformation(all_ends.positions, all_ends.times))
         output = canonical.between(first, last, directions, times)
         length = (ends - starts).norm(dim=-1)
         is_long = length > 0
-        share = (last - first).norm(dim=-1) / torch.where(is_long, length, 1)
+        share = torch.where(is_long, (last - first).norm(dim=-1) / torch.where(is_long, length, 1), 1)
         extras = {"canonical_positions": 0.5 * (first + last), "positions": 0.5 * (starts + ends), "times": times}
-        return FieldOutput(
-            torch.where(is_long, output.density * share, output.density), output.rgb, {**output.extras, **extras}
-        )
+        return replace(output, density=output.density * share, extras={**output.extras, **extras})
 
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
         """The same with both parts at that time."""

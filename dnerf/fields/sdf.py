@@ -13,7 +13,6 @@ from dnerf.core.compositing import FieldOutput
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.base import IntervalAware, RadianceField, SignedDistance, ends_of
 from dnerf.fields.grid import GridField
-from dnerf.nn.parameter_groups import ParameterGroup
 
 
 class SDFField(GridField, SignedDistance):
@@ -55,10 +54,6 @@ class SDFField(GridField, SignedDistance):
         self.cell_sizes = nn.Buffer(float(sides.max()) / torch.tensor(cells), persistent=False)
         with torch.no_grad():
             self._last[1][0] = 0
-
-    def parameter_groups(self) -> list[ParameterGroup]:
-        """The networks, and the surface's width, in "head"; features are left in "default"."""
-        return [*super().parameter_groups(), ParameterGroup("head", (self.log_width,))]
 
     @property
     def sharpness(self) -> Tensor:

@@ -14,21 +14,21 @@ from dnerf.samplers.base import Sampler
 
 logger = logging.getLogger(__name__)
 
+MOST_BISECTIONS = 30  # more do not change float32
+
 Distances = Callable[[Tensor, Tensor], Tensor]
 """Of rays with numbers (n,) int64 at (n,) along them."""
-
-LATTICE = 32  # places along each side of the box at which a field is searched for a surface
 
 
 class SphereTracingSampler(Sampler):
     """Steps along rays as far as the signed distance says that nothing is, until it is zero.
 
-    A step is the distance divided by how steeply it may fall: one for a true distance; under a deformation, the largest
-    singular value of its Jacobian, as found at random places of the box at the rays' times, times `safety`. A step that
-    was too long, across a surface, is seen by its sign and bisected; one that crosses a thin body whole is not seen.
+    A step is the distance divided by how steep it may be: the length of its gradient times the largest singular value
+    of the deformation's Jacobian, the most at random places of the box at the rays' times, times `safety`. A step that
+    crosses a surface is seen by its sign and bisected; one through a thin body is not.
 
-    Samples are opaque, see `Samples`, and show the field's colour at the surface: the image is that of the volume as
-    its sharpness grows. Rays that miss have none. No gradient reaches the distance: train with another sampler.
+    Samples are opaque, see `Samples`: the image is that of the volume as its sharpness grows. Rays that miss have none.
+    No gradient reaches the distance: train with another sampler.
 
     Source: Hart 1996, "Sphere tracing", theorem 1 for the bound under a deformation.
 
@@ -56,7 +56,7 @@ class SphereTracingSampler(Sampler):
         self.box = nn.Buffer(as_box(box), persistent=False)
         self.num_steps, self.tolerance = num_steps, tolerance
         self.safety, self.num_probes = safety, num_probes
-        self.is_checked = False
+        self.has_warned = False
 
     @torch.no_grad()
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
@@ -74,7 +74,12 @@ class SphereTracingSampler(Sampler):
     def _hits(self, rays: Rays, surface: SignedDistance) -> tuple[Tensor, Tensor]:
         """Numbers (H,) of the rays that meet a surface, and where (H,)."""
         near, far = clip_to_box(rays.origins, rays.directions, rays.near, rays.far, self.box.to(rays.near.dtype))
-        steepness = self._steepness(surface, rays)
+        numbers = (far > near).nonzero()[:, 0]
+        t, before = near[numbers], near[numbers]
+        found = [(numbers[:0], t[:0])]
+        if not len(numbers):
+            return found[0]
+        probed, steepness = self._probe(surface, rays)
 
         def distances(numbers: Tensor, t: Tensor) -> Tensor:
             padding = -len(t) % PAD_TO  # matrix libraries compile code for every new number of rows
@@ -82,9 +87,6 @@ class SphereTracingSampler(Sampler):
             positions, _, times = rays.places(numbers, t)
             return surface.distance(positions, times)[: len(t) - padding]
 
-        numbers = (far > near).nonzero()[:, 0]
-        t, before = near[numbers], near[numbers]
-        found = [(numbers[:0], t[:0])]
         for _ in range(self.num_steps):
             if not len(numbers):
                 break
@@ -97,40 +99,28 @@ class SphereTracingSampler(Sampler):
             before, t = t, t + (distance / steepness).clamp(min=self.tolerance)
             goes_on = ~is_there & (t < far[numbers])
             numbers, before, t = numbers[goes_on], before[goes_on], t[goes_on]
-        if len(found) == 1 and not self.is_checked:
-            self._warn_of_nothing(surface, rays, steepness)
-        self.is_checked = True
+        if len(found) == 1 and not self.has_warned and bool((probed > 0).all()):
+            self.has_warned = True
+            logger.warning("no ray meets a surface: the signed distance in the box is above %.3g", float(probed.min()))
         first, second = zip(*found)
         return torch.cat(first), torch.cat(second)
 
     def _bisected(self, distances: Distances, numbers: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """Where (H,) the distance is zero between a place outside and one inside, to the tolerance."""
-        while len(low) and bool((high - low).max() > self.tolerance):
+        for _ in range(MOST_BISECTIONS):
+            if not len(low) or bool((high - low).max() <= self.tolerance):
+                break
             middle = 0.5 * (low + high)
             is_outside = distances(numbers, middle) > 0
             low, high = torch.where(is_outside, middle, low), torch.where(is_outside, high, middle)
         return low
 
-    def _steepness(self, surface: SignedDistance, rays: Rays) -> Tensor:
-        """A bound (), as far as probes tell, on how much the distance changes per unit of length; at least 1."""
-        if not len(rays):
-            return rays.near.new_ones(())
+    def _probe(self, surface: SignedDistance, rays: Rays) -> tuple[Tensor, Tensor]:
+        """Distances (P,) at probes in the box, and a bound () on how steep they are, at least 1."""
         generator = torch.Generator(rays.near.device).manual_seed(0)
         unit = torch.rand(self.num_probes, 4, generator=generator, device=rays.near.device, dtype=rays.near.dtype)
-        box = self.box.to(unit.dtype)
+        low, high = self.box.to(unit.dtype)
+        places = torch.lerp(low, high, unit[:, :3])
         times = rays.times[(unit[:, 3] * len(rays)).long().clamp(max=len(rays) - 1)]
-        found = surface.steepness(torch.lerp(box[0], box[1], unit[:, :3]), times)
-        return (self.safety * found.max()).clamp(min=1) if bool((found != 1).any()) else found.max()
-
-    def _warn_of_nothing(self, surface: SignedDistance, rays: Rays, steepness: Tensor) -> None:
-        """Say so, once, if there is no surface in the box at the first ray's time."""
-        if not len(rays):
-            return
-        axes = [torch.linspace(0, 1, LATTICE, device=rays.near.device, dtype=rays.near.dtype)] * 3
-        box = self.box.to(rays.near.dtype)
-        places = torch.lerp(box[0], box[1], torch.cartesian_prod(*axes))
-        distance = surface.distance(places, rays.times[:1].expand(len(places)))
-        reach = 0.5 * ((box[1] - box[0]) / (LATTICE - 1)).norm() * steepness
-        if bool((distance.abs() > reach).all()):
-            low, high = float(distance.min()), float(distance.max())
-            logger.warning("the signed distance has no zero in the box: it goes from %.3g to %.3g there", low, high)
+        steepest = surface.steepness(places, times).max()
+        return surface.distance(places, times), torch.where(steepest == 1, 1, self.safety * steepest).clamp(min=1)

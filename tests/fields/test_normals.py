@@ -8,7 +8,7 @@ from dnerf.core.backgrounds import ConstantBackground
 from dnerf.core.cameras import Camera, Intrinsics, look_at
 from dnerf.core.compositing import FieldOutput
 from dnerf.deformations import CachedDeformation, Deformation, DisplacementDeformation
-from dnerf.fields import DeformedField, NeuSField, NormalField, RadianceField, normals
+from dnerf.fields import DeformedField, NeuSField, RadianceField, normals
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
@@ -114,17 +114,6 @@ def test_the_image_of_normals_is_that_of_the_surface(deformed: bool) -> None:
     degrees = torch.rad2deg(torch.acos((image * exact).sum(-1).clamp(max=1)))[facing]
     assert degrees.max() < 1  # the layer that absorbs is 5e-3 thick
     assert image[~hit].norm(dim=-1)[0] == 0  # the corner
-
-
-def test_density_and_intervals_of_normals_are_those_of_the_field() -> None:
-    field, (positions, times) = ball(0.1), some_points()
-    shown = NormalField(field)
-    ends = positions + 0.05
-    assert torch.equal(shown.density(positions, times), field.density(positions, times))
-    expected = field.between(positions, ends, ends, times).density
-    assert torch.equal(shown.between(positions, ends, ends, times).density, expected)
-    assert shown.knows_intervals
-    assert not NormalField(Cloud()).knows_intervals
 
 
 def test_exact_scenes_have_exact_distances_and_normals() -> None:

@@ -47,9 +47,13 @@ def term(field: RadianceField) -> Tensor:
     return loss(model(rays), NOTHING, model)
 
 
-@pytest.mark.parametrize("factor", [1.0, 0.5, 3.0])
+@pytest.mark.parametrize("factor", [1.0, 0.5, 3.0, 0.0])
 def test_the_term_is_the_squared_deviation_of_the_slope_from_one(factor: float) -> None:
-    assert float(term(slope(factor)).detach()) == pytest.approx((factor - 1) ** 2, abs=1e-5)
+    field = slope(factor)
+    value = term(field)
+    assert float(value.detach()) == pytest.approx((factor - 1) ** 2, abs=1e-5)
+    value.backward()
+    assert field.table.grad.isfinite().all()
 
 
 def test_it_holds_in_canonical_space() -> None:
@@ -68,29 +72,6 @@ def test_differences_are_the_gradient_up_to_second_order() -> None:
     errors = [(differences(field, x, x[:, 0], h) - exact).norm(dim=-1).detach().quantile(0.7) for h in (2e-3, 1e-3)]
     assert errors[0] < 1e-4
     assert errors[1] < 0.3 * errors[0]
-
-
-def test_minimising_it_makes_a_distance_of_what_is_none() -> None:
-    torch.manual_seed(0)
-    field = NeuSField(BOX, (4, 8), 2, max_rows=1024, hidden_features=16, num_layers=1)
-    with torch.no_grad():
-        field.table.mul_(20)
-    optimizer = torch.optim.Adam(field.parameters(), 5e-3)
-    values = []
-    for _ in range(60):
-        loss = term(DeformedField(IdentityDeformation(), field))
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        values.append(float(loss.detach()))
-    assert values[-1] < 0.2 * values[0]
-    assert all(p.grad.isfinite().all() for p in field.parameters() if p.grad is not None)
-
-
-def test_a_level_distance_has_finite_gradients() -> None:
-    field = slope(0.0)
-    term(field).backward()
-    assert field.table.grad.isfinite().all()
 
 
 def test_fields_without_a_surface_are_named() -> None:

@@ -167,7 +167,11 @@ def test_broken_off_renderings_give_the_same_bytes(tmp_path: Path) -> None:
     whole = film(tmp_path / "whole")
     assert {name for name in whole if "/" not in name} == {
         "film.npz",
-        *(f"film{suffix}.{f}" for suffix in ("", "_depth", "_opacity", "_motion", "_compare") for f in ("mp4", "gif")),
+        *(
+            f"film{suffix}.{f}"
+            for suffix in ("", "_depth", "_opacity", "_motion", "_normals", "_compare")
+            for f in ("mp4", "gif")
+        ),
     }
     assert film(tmp_path / "resumed", stop_after=2) == whole
 
