@@ -40,24 +40,3 @@ def folding(deformation: Deformation, positions: Tensor, times: Tensor) -> Foldi
     determinants, smallest = torch.linalg.det(found), torch.linalg.svdvals(found)[:, -1].sort().values
     low, high = (float(smallest[round(share * (len(smallest) - 1))]) for share in MIDDLE)
     return Folding(float(determinants.min()), float((determinants < 0).float().mean()), (low, high))
-
-
-@torch.no_grad()
-def largest_stretch(deformation: Deformation, positions: Tensor, times: Tensor, *, step: float = 1e-2) -> Tensor:
-    """The largest singular value (...,) of a deformation's Jacobian matrices, from central differences.
-
-    These need no gradients, so they serve deformations of one frame kept on a lattice, too.
-
-    Args:
-        deformation: world -> canonical.
-        positions: (..., 3) in world units.
-        times: (...,) in [0, 1].
-        step: of the differences, in world units.
-    """
-    check_positions_times(positions, times)
-    shape = times.shape
-    steps = step * torch.eye(3, dtype=positions.dtype, device=positions.device)
-    places = positions.reshape(-1, 1, 1, 3) + torch.stack([steps, -steps])
-    moved = deformation(places, times.reshape(-1, 1, 1).expand(places.shape[:-1]))
-    columns = (moved[:, 0] - moved[:, 1]).float() / (2 * step)
-    return torch.linalg.matrix_norm(columns, ord=2).to(positions.dtype).reshape(shape)

@@ -84,10 +84,6 @@ class SignedDistance(ABC):
     def distance(self, positions: Tensor, times: Tensor) -> Tensor:
         """Signed distance (...,), in world units, at positions (..., 3) and times (...,), with gradients."""
 
-    def steepness(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Most (...,) by which the distance changes for each unit of length around there; 1 for a true distance."""
-        return torch.ones_like(positions[..., 0])
-
 
 class HasRoughness(ABC):
     """A part that keeps values on lattices, whose differences between neighbours may be given a price."""

@@ -9,7 +9,6 @@ from dnerf.core.compositing import FieldOutput
 from dnerf.core.shortcuts import speaks_for
 from dnerf.deformations import CachedAtTime, Deformation
 from dnerf.deformations.base import deformation_at_time, unwrapped
-from dnerf.deformations.jacobian import largest_stretch
 from dnerf.fields.base import (
     FrameTabled,
     IntervalAware,
@@ -69,13 +68,6 @@ class DeformedField(RadianceField, IntervalAware, SignedDistance):
         surface = surface_of(self.canonical)
         assert surface is not None, "asked only if has_surface"
         return surface.distance(unwrapped(self.deformation)(positions, times), times)
-
-    def steepness(self, positions: Tensor, times: Tensor) -> Tensor:
-        """The canonical field's, times the largest stretch of the deformation."""
-        surface, deformation = surface_of(self.canonical), unwrapped(self.deformation)
-        assert surface is not None, "asked only if has_surface"
-        stretch = largest_stretch(deformation, positions, times)
-        return stretch * surface.steepness(deformation(positions, times), times)
 
     def between(self, starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """What the canonical field says of the straight interval between where both ends go, per unit of length here.

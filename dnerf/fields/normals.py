@@ -6,7 +6,7 @@ from torch import Tensor
 from dnerf.core.compositing import FieldOutput
 from dnerf.core.geometry import safe_normalize
 from dnerf.deformations.base import check_positions_times
-from dnerf.fields.base import IntervalAware, RadianceField, field_at_time, interval_aware, surface_of
+from dnerf.fields.base import IntervalAware, RadianceField, SignedDistance, field_at_time, interval_aware, surface_of
 
 FAINT = 1e-3  # opacity, up to which the direction of what an image shows is rounding
 
@@ -29,6 +29,19 @@ def normals(field: RadianceField, positions: Tensor, times: Tensor) -> Tensor:
             raise ValueError(f"field must be differentiable to positions, got {type(field).__name__}")
         (gradient,) = torch.autograd.grad(values.sum(), x, allow_unused=True)
     return torch.zeros_like(positions) if gradient is None else safe_normalize(gradient)
+
+
+def differences(surface: SignedDistance, positions: Tensor, times: Tensor, step: Tensor | float) -> Tensor:
+    """Gradients (N, 3) of a distance at positions (N, 3) from central differences, which can be trained by.
+
+    The step is in world units. Unlike `normals` they serve deformations of one frame kept on a lattice, too.
+    """
+    steps = step * torch.eye(3, dtype=positions.dtype, device=positions.device)
+    # Networks in half precision round by as much as the differences are.
+    with torch.autocast(positions.device.type, enabled=False):
+        places = positions + torch.stack([steps, -steps])[:, :, None]
+        up, down = surface.distance(places, times.expand(2, 3, -1))
+    return ((up - down) / (2 * step)).mT
 
 
 class NormalField(RadianceField, IntervalAware):

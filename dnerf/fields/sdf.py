@@ -85,13 +85,6 @@ class SDFField(GridField, SignedDistance):
         values = values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
         return self._distance(positions, values[..., 0]), values[..., 1:]
 
-    def steepness(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Length (...,) of the distance's gradient."""
-        with torch.enable_grad():
-            x = positions.detach().requires_grad_()
-            (gradient,) = torch.autograd.grad(self.distance(x, times).sum(), x)
-        return gradient.norm(dim=-1)
-
     @abstractmethod
     def density_of(self, distance: Tensor) -> Tensor:
         """Density (...,), in 1 / world unit, of a surface met head-on, at signed distances (...,)."""

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import as_box, check_positive, check_whole
+from dnerf.core.checks import as_box, check_whole
 from dnerf.core.compositing import Rendering
 from dnerf.core.schedules import Schedule
 from dnerf.fields.base import RadianceField, SignedDistance, surface_of
+from dnerf.fields.normals import differences
 from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import spread_numbers
 from dnerf.rendering.renderer import Renderer
@@ -72,25 +73,5 @@ class EikonalLoss(Loss):
             chosen = spread_numbers(extras["times"].shape, self.num_points, unit.device)
             places.append(extras["canonical_positions"].detach().reshape(-1, 3)[chosen])
             times.append(extras["times"].reshape(-1)[chosen])
-        gradients = differences(surface, torch.cat(places), torch.cat(times))
+        gradients = differences(surface, torch.cat(places), torch.cat(times), surface.detail)
         return (gradients.norm(dim=-1) - 1).square().mean()
-
-
-def differences(surface: SignedDistance, positions: Tensor, times: Tensor, step: float | None = None) -> Tensor:
-    """Gradients (N, 3) of a distance from central differences, which train what is evaluated.
-
-    Args:
-        surface: what has the distance.
-        positions: (N, 3).
-        times: (N,).
-        step: in world units; the size of the surface's details if None.
-    """
-    if step is not None:
-        check_positive("step", step)
-    length = surface.detail if step is None else step
-    steps = length * torch.eye(3, dtype=positions.dtype, device=positions.device)
-    # Networks in half precision round by as much as the differences are.
-    with torch.autocast(positions.device.type, enabled=False):
-        places = positions + torch.stack([steps, -steps])[:, :, None]
-        up, down = surface.distance(places, times.expand(2, 3, -1))
-    return ((up - down) / (2 * length)).mT

@@ -10,10 +10,12 @@ from dnerf.core.checks import as_box, check_positive, check_whole
 from dnerf.core.geometry import clip_to_box
 from dnerf.core.rays import Rays, Samples
 from dnerf.fields.base import PAD_TO, RadianceField, SignedDistance, surface_of
+from dnerf.fields.normals import differences
 from dnerf.samplers.base import Sampler
 
 logger = logging.getLogger(__name__)
 
+PROBE_STEP = 1e-3  # world units, of differences of the distance
 MOST_BISECTIONS = 30  # more do not change float32
 
 Distances = Callable[[Tensor, Tensor], Tensor]
@@ -23,9 +25,10 @@ Distances = Callable[[Tensor, Tensor], Tensor]
 class SphereTracingSampler(Sampler):
     """Steps along rays as far as the signed distance says that nothing is, until it is zero.
 
-    A step is the distance divided by how steep it may be: the length of its gradient times the largest singular value
-    of the deformation's Jacobian, the most at random places of the box at the rays' times, times `safety`. A step that
-    crosses a surface is seen by its sign and bisected; one through a thin body is not.
+    A step is the distance divided by how steep it may be in the world: its gradient, to which a deformation adds the
+    factor of its transposed Jacobian, is measured at random places of the box at the rays' times, and the longest,
+    times `safety`, is the bound. A step that crosses a surface is seen by its sign and bisected; one through a thin
+    body is not.
 
     Samples are opaque, see `Samples`: the image is that of the volume as its sharpness grows. Rays that miss have none.
     No gradient reaches the distance: train with another sampler.
@@ -122,5 +125,5 @@ class SphereTracingSampler(Sampler):
         low, high = self.box.to(unit.dtype)
         places = torch.lerp(low, high, unit[:, :3])
         times = rays.times[(unit[:, 3] * len(rays)).long().clamp(max=len(rays) - 1)]
-        steepest = surface.steepness(places, times).max()
-        return surface.distance(places, times), torch.where(steepest == 1, 1, self.safety * steepest).clamp(min=1)
+        steepest = differences(surface, places, times, PROBE_STEP).norm(dim=-1).max()
+        return surface.distance(places, times), (self.safety * steepest).clamp(min=1)

@@ -80,15 +80,6 @@ def test_where_a_field_is_level_there_is_no_normal() -> None:
     assert torch.equal(normals(ball(), torch.zeros(1, 3), torch.zeros(1)), torch.zeros(1, 3))  # the ball's centre
 
 
-def test_a_field_without_derivatives_is_named() -> None:
-    class Constant(Cloud):
-        def density(self, positions: Tensor, times: Tensor) -> Tensor:
-            return torch.ones(positions.shape[:-1])
-
-    with pytest.raises(ValueError, match="field must be differentiable to positions, got Constant"):
-        normals(Constant(), torch.zeros(3, 3), torch.zeros(3))
-
-
 def seen_ball(renderer: Renderer) -> tuple[Tensor, Tensor]:
     """Normals as an image, and those of the ball where the rays meet it; NaN where they miss."""
     camera = Camera(Intrinsics.from_angle(24, 24, 0.7), look_at((0.0, -3.0, 0.5), (0.0, 0.0, 0.0)), 1.0, 5.0)

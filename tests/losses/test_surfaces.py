@@ -7,8 +7,9 @@ from torch import Tensor
 from dnerf.core.rays import Rays
 from dnerf.deformations import Deformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, NeuSField, RadianceField
+from dnerf.fields.normals import differences
 from dnerf.losses import Batch, EikonalLoss
-from dnerf.losses.surfaces import canonical_surface, differences
+from dnerf.losses.surfaces import canonical_surface
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 

@@ -13,8 +13,7 @@ from dnerf.core.rays import Rays
 from dnerf.deformations import Deformation
 from dnerf.fields import DeformedField, GridField, NeuSField, VolSDFField
 from dnerf.rendering.renderer import Renderer
-from dnerf.samplers import SphereTracingSampler, StratifiedSampler
-from dnerf.scenes import make_scene
+from dnerf.samplers import SphereTracingSampler, StratifiedSampler, sphere_tracing
 
 BOX = [[-1.3, -1.3, -1.3], [1.3, 1.3, 1.3]]
 CAMERA = Camera(Intrinsics.from_angle(32, 32, 0.7), look_at((0.5, -3.0, 0.8), (0.0, 0.0, 0.0)), 1.0, 6.0)
@@ -67,23 +66,20 @@ def test_hits_are_where_rays_first_come_inside(deformed: bool) -> None:
     assert torch.equal(samples.ray_indices, samples.ray_indices.unique())
 
 
-def test_a_bound_on_the_stretch_keeps_steps_out_of_flat_bodies() -> None:
+def test_a_bound_on_the_stretch_keeps_steps_out_of_flat_bodies(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without it a step of the canonical distance leaps through a body that is thin in the world."""
 
     class Flat(Deformation):
         def forward(self, positions: Tensor, times: Tensor) -> Tensor:
             return positions * torch.tensor([1.0, 1.0, 40.0])
 
-    class Unbounded(DeformedField):
-        def steepness(self, positions: Tensor, times: Tensor) -> Tensor:
-            return torch.ones_like(times)
-
     x = torch.linspace(-0.4, 0.4, 50)
     origins = torch.stack([x, 0 * x, 1.2 + 0 * x], dim=-1)
     rays = Rays(origins, torch.tensor([0.0, 0, -1]).expand(50, 3), 0 * x, 0 * x, 2.4 + 0 * x)
-    sampler = SphereTracingSampler(BOX, num_steps=1000)
-    assert len(sampler(rays, DeformedField(Flat(), field_like_trained())).starts) == 50
-    assert len(sampler(rays, Unbounded(Flat(), field_like_trained())).starts) < 50
+    sampler, field = SphereTracingSampler(BOX, num_steps=1000), DeformedField(Flat(), field_like_trained())
+    assert len(sampler(rays, field).starts) == 50
+    monkeypatch.setattr(sphere_tracing, "differences", lambda surface, positions, *_: torch.zeros_like(positions))
+    assert len(sampler(rays, field).starts) < 50
 
 
 @pytest.mark.parametrize("kind", [NeuSField, VolSDFField])
@@ -103,19 +99,6 @@ def test_the_volume_becomes_the_surface_as_it_sharpens(kind: type, deformed: boo
     for before, after in pairwise(errors):
         assert all(b < 0.5 * a for a, b in zip(before, after, strict=True))  # in proportion to the width: a quarter
     assert errors[-1][1] < 0.01
-
-
-def test_exact_scenes_are_traced_to_their_exact_hits() -> None:
-    scene = make_scene("orbiting_balls")
-    rays = CAMERA.rays(0.2)
-    samples = SphereTracingSampler(scene.box, tolerance=1e-5)(rays, scene)
-    exact = scene.exact_samples(rays)
-    counts = exact.offsets.diff()
-    hits = exact.starts[exact.offsets[:-1].clamp(max=len(exact.starts) - 1)]
-    found = torch.full((len(rays),), torch.nan).scatter(0, samples.ray_indices, samples.points)
-    both = (counts > 0) & found.isfinite()
-    assert ((counts > 0) == found.isfinite()).float().mean() > 0.99
-    assert (found - hits)[both].abs().quantile(0.95) < 1e-4  # the tolerance, met at an angle
 
 
 def test_rays_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
