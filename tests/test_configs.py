@@ -82,7 +82,7 @@ def test_every_loss_joins_the_flow() -> None:
     assert set(trainer.losses) == set(names("trainer/losses")) - {
         "eikonal",
         "histogram",
-    }  # see experiment=sdf and proposal
+    }  # of others
     record = trainer.fit(renderer, data.frames("train"))
     assert set(record.losses) == {"loss", *trainer.losses}  # all of them have their turn in every fourth step
 
