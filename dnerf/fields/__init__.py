@@ -24,6 +24,6 @@ from dnerf.fields.voxels import VoxelField
 __all__ = [
     "AmbientCoordinates", "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware",
     "NeRFField", "NetworkTabled", "NeuSField", "NormalField", "PlaneFeatures", "PlanesField", "RadianceField",
-    "SDFField", "SignedDistance", "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence",
-    "VolSDFField", "VoxelField", "evaluate_along_rays", "normals",
+    "SDFField", "SignedDistance", "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence", "VolSDFField",
+    "VoxelField", "evaluate_along_rays", "normals",
 ]  # fmt: skip
