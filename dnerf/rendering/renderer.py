@@ -15,6 +15,7 @@ from dnerf.core.rays import Rays, Samples
 from dnerf.core.schedules import Scheduled
 from dnerf.core.shortcuts import speaks_for
 from dnerf.fields.base import RadianceField, evaluate_samples
+from dnerf.rendering.exposure import Exposure
 from dnerf.rendering.frame_graphs import FrameGraphs
 from dnerf.rendering.image import image_columns
 from dnerf.samplers.base import Capacity, FixedCapacity, Sampler
@@ -44,6 +45,7 @@ class Renderer(nn.Module):
             colours by at most as much, and by as much again for each interval that a sampler which subdivides leaves
             out since its weight is as small; 0 to evaluate the field everywhere. Without effect on other quadratures
             than the constant one, whose intervals do not depend on their neighbours.
+        exposure: of the training images' camera, in training mode; images show the scene without it. None for none.
 
     Raises:
         ValueError: for another precision or quadrature, a transmittance outside [0, 1), or graphs with a sampler that
@@ -53,6 +55,7 @@ class Renderer(nn.Module):
     def __init__(
         self, field: RadianceField, sampler: Sampler, background: Background | None = None, *,
         precision: str = "float32", stop_transmittance: float = 0.0, quadrature: str = "constant", graphs: bool = False,
+        exposure: Exposure | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         if not 0 <= stop_transmittance < 1:
@@ -68,6 +71,7 @@ class Renderer(nn.Module):
         self.stop_transmittance = stop_transmittance
         self.quadrature = quadrature
         self.graphs = graphs
+        self.exposure = exposure
         self.generation = 0
         self._frames: FrameGraphs | None = None
 
@@ -108,13 +112,19 @@ class Renderer(nn.Module):
             self.sampler.observe(positions.detach(), times, density)
         rendering = composite(samples, output, quadrature=self.quadrature)
         background = self.behind(rays, rendering.opacity, generator)
-        rendering = over(rendering, background)
+        rendering = self._exposed(over(rendering, background), rays)
         if not samples.proposals:
             return rendering
         proposals = tuple(
-            composite(placed, said, background, quadrature=self.quadrature) for placed, said in samples.proposals
+            self._exposed(composite(placed, said, background, quadrature=self.quadrature), rays)
+            for placed, said in samples.proposals
         )
         return Rendering(**{**vars(rendering), "proposals": proposals})
+
+    def _exposed(self, rendering: Rendering, rays: Rays) -> Rendering:
+        if self.exposure is None or not self.training:
+            return rendering
+        return replace(rendering, rgb=self.exposure(rendering.rgb, rays.times))
 
     def behind(self, rays: Rays, opacity: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Colours (R, 3) behind rays of such opacity (R,); black where a costly background could not be seen."""

@@ -1,0 +1,86 @@
+"""A camera's drifting exposure is learnt apart from the scene, and is not in images."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from dnerf.core.cameras import Camera, Intrinsics, look_at
+from dnerf.core.rays import Rays
+from dnerf.rendering import Exposure, Renderer
+from dnerf.samplers import StratifiedSampler
+from dnerf.scenes import make_scene
+
+TIMES = torch.linspace(0, 1, 41)
+
+
+def drifting(factors: list[list[float]]) -> Exposure:
+    exposure = Exposure(len(factors))
+    exposure.logarithms.data.copy_(torch.tensor(factors).log())
+    return exposure
+
+
+def test_colours_are_as_they_are_at_first_and_gradients_flow() -> None:
+    exposure, rgb = Exposure(), torch.rand(41, 3)
+    shown = exposure(rgb, TIMES)
+    torch.testing.assert_close(shown, rgb, rtol=0, atol=0)
+    (shown * (TIMES[:, None] - 0.5)).sum().backward()
+    assert exposure.logarithms.grad is not None
+    assert float(exposure.logarithms.grad.abs().max()) > 0.1
+
+
+def test_logarithms_of_factors_are_linear_between_times() -> None:
+    exposure = drifting([[2.0, 1.0, 0.5], [1.0, 1.0, 1.0], [0.5, 1.0, 2.0]])
+    for time, factors in ((0.0, (2, 1, 0.5)), (0.25, (2**0.5, 1, 2**-0.5)), (0.5, (1, 1, 1)), (1.0, (0.5, 1, 2))):
+        shown = exposure(torch.full((1, 3), 0.4), torch.tensor([time]))
+        torch.testing.assert_close(shown, 0.4 * torch.tensor([factors]), rtol=1e-6, atol=0)
+
+
+def test_brightness_as_a_whole_is_the_scene_s() -> None:
+    factors = torch.rand(7, 3) + 0.5
+    rgb, times = torch.rand(41, 3), TIMES
+    torch.testing.assert_close(drifting(factors.tolist())(rgb, times), drifting((3 * factors).tolist())(rgb, times))
+
+
+def test_its_derivatives_are_right() -> None:
+    exposure = Exposure(4).double()
+    rgb = torch.rand(9, 3, dtype=torch.float64, requires_grad=True)
+    times = torch.linspace(0.01, 0.97, 9, dtype=torch.float64)
+
+    def shown(rgb: torch.Tensor, logarithms: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(exposure, {"logarithms": logarithms}, (rgb, times))
+
+    assert torch.autograd.gradcheck(shown, (rgb, torch.rand(4, 3, dtype=torch.float64, requires_grad=True)))
+
+
+def test_a_drift_is_found_beside_colours_that_are_learnt_too() -> None:
+    """Eight places, each seen at all times: the exact factors, up to one for all times, which is the colours'."""
+    colors, truth = torch.rand(8, 3) * 0.6 + 0.2, torch.exp(0.2 * torch.sin(2 * math.pi * TIMES))[:, None]
+    exposure, learnt = Exposure(21), nn.Parameter(torch.full((8, 3), 0.5))
+    optimizer = torch.optim.Adam([*exposure.parameters(), learnt], lr=0.01)
+    for _ in range(600):
+        optimizer.zero_grad()
+        shown = torch.stack([exposure(color.expand(41, 3), TIMES) for color in learnt])
+        (shown - colors[:, None] * truth).square().mean().backward()
+        optimizer.step()
+    scale = learnt.detach() / colors
+    found = exposure(torch.ones(41, 3), TIMES).detach()
+    torch.testing.assert_close(found * scale.mean(), truth.expand(41, 3), rtol=0.02, atol=0)
+    torch.testing.assert_close(scale, scale.mean().expand(8, 3), rtol=0.02, atol=0)
+
+
+def test_it_is_in_training_and_not_in_images() -> None:
+    exposure = drifting([[2.0, 1.0, 0.5], [0.5, 1.0, 2.0]])
+    plain = Renderer(make_scene("static"), StratifiedSampler(16))
+    exposed = Renderer(make_scene("static"), StratifiedSampler(16), exposure=exposure)
+    camera = Camera(Intrinsics.from_angle(4, 4, 0.7), look_at((4.0, 0.0, 0.0)))
+    assert torch.equal(exposed.render_image(camera, 0.0).rgb, plain.render_image(camera, 0.0).rgb)
+    rays: Rays = camera.rays(0.0)
+    seen = [model(rays, generator=torch.Generator().manual_seed(0)).rgb for model in (exposed, plain)]
+    torch.testing.assert_close(seen[0], seen[1] * torch.tensor([2.0, 1.0, 0.5]))
+
+
+def test_one_time_is_refused() -> None:
+    with pytest.raises(ValueError, match="num_times must be at least 2, got 1"):
+        Exposure(1)
