@@ -13,7 +13,7 @@ from dnerf.core.spherical_harmonics import check_degree, spherical_harmonics
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import HasRoughness, RadianceField, TimeDependence
-from dnerf.fields.grid import VIEW_SCALE
+from dnerf.fields.head import VIEW_SCALE
 from dnerf.kernels import GridLevels, grid_encode
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
