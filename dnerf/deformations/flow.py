@@ -10,7 +10,7 @@ from dnerf.core.checks import check_choice, check_positive
 from dnerf.deformations.base import InvertibleDeformation, check_positions_times
 from dnerf.deformations.inversion import attach_gradient, invert
 from dnerf.deformations.solvers import RightHandSide, Solver, failure
-from dnerf.deformations.velocities.base import Velocity
+from dnerf.deformations.velocities import Velocity
 
 IN_TIME = ("varying", "stationary")
 
