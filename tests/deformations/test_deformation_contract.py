@@ -43,7 +43,6 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
     "se3": lambda: SE3Deformation(2, 16, (), position_frequencies=2, canonical_time=None),
     "se3, canonical time": lambda: SE3Deformation(2, 16, (), position_frequencies=2),
     "flow": lambda: FlowDeformation(network_velocity(), 0.5),
-    "flow, adjoint": lambda: FlowDeformation(network_velocity(), num_steps=4, gradient="adjoint"),
     "flow, stationary velocity": lambda: FlowDeformation(
         network_velocity(), None, velocity_in_time="stationary", solver="midpoint", num_steps=1
     ),
