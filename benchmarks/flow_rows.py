@@ -20,7 +20,7 @@ from dnerf.deformations import (
     SE3Deformation,
 )
 from dnerf.deformations.solvers import ADAPTIVE_SOLVERS, FIXED_SOLVERS
-from dnerf.deformations.velocities import CurlVelocity, NetworkVelocity, RigidVelocity, Velocity
+from dnerf.deformations.velocities import NetworkVelocity, Velocity
 
 BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
 STEPS = (1, 2, 4, 8, 16, 32, 64)
@@ -146,8 +146,6 @@ def variants() -> dict[str, Deformation]:
         "flow, stationary, 1 midpoint step (3 x 128)": stationary(),
         "flow, stationary, 1 midpoint step (3 x 64)": stationary(hidden_features=64),
         "flow, varying, 2 midpoint steps (3 x 128)": varying(network()),
-        "flow, varying, 2 midpoint steps, curl of 64 waves": varying(CurlVelocity(BOX)),
-        "flow, varying, 2 midpoint steps, 16 rigid clusters": varying(RigidVelocity(BOX)),
         "flow, varying, 8 RK4 steps (3 x 64, silu)": varying(NetworkVelocity(BOX, 3, 64), "rk4", 8),
     }
 

@@ -23,7 +23,7 @@ from dnerf.training.checkpoint_folder import CHECKPOINTS, CheckpointFolder
 CHANGEABLE = (
     "out_dir", "resume", "device", "data_root", "evaluate_split", "evaluate_frames", "chunk", "data.root",
     "trainer.num_steps", "trainer.max_seconds", "trainer.log_every", "trainer.callbacks.box_warning",
-    *(f"trainer.callbacks.{name}" for name in ("checkpoints", "log", "tensorboard", "previews", "progress_bar")),
+    *(f"trainer.callbacks.{name}" for name in ("checkpoints", "log", "previews", "progress_bar")),
 )  # fmt: skip
 OWN_FOLDERS = (CHECKPOINTS, "previews")
 

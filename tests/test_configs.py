@@ -87,8 +87,6 @@ def test_every_loss_joins_the_flow() -> None:
 
 @pytest.mark.parametrize("callback", names("trainer/callbacks"))
 def test_every_callback_joins_the_training(callback: str, tmp_path: Path) -> None:
-    if callback == "tensorboard":
-        pytest.importorskip("tensorboard")
     data, renderer, trainer = parts(*TINY, f"+trainer/callbacks={callback}")
     assert isinstance(trainer.callbacks[callback], Callback)
     assert trainer.fit(renderer, data.frames("train"), folder=tmp_path).step == 2

@@ -1,6 +1,6 @@
 """Neural-ODE flow: a velocity field carries points between any time and the canonical one (Chen et al. 2018)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import cast
 
 import torch
@@ -10,7 +10,7 @@ from dnerf.core.checks import check_choice, check_positive
 from dnerf.deformations.base import InvertibleDeformation, check_positions_times
 from dnerf.deformations.inversion import attach_gradient, invert
 from dnerf.deformations.solvers import RightHandSide, Solver, failure
-from dnerf.deformations.velocities.base import Velocity
+from dnerf.deformations.velocities import Velocity
 
 IN_TIME = ("varying", "stationary")
 
@@ -40,7 +40,6 @@ class FlowDeformation(InvertibleDeformation):
         solver: name, see `Solver`.
         num_steps: of a fixed-step solver.
         rtol, atol, max_steps: of an adaptive solver, see `Solver`.
-        gradient: "direct" or "adjoint", see `Solver`.
         corrections: round trips by which `inverse` is made the inverse of the *discretised* `forward` (see `invert`):
             the equation solved backwards, which 0 leaves as it is, misses it by both solves' errors.
 
@@ -50,8 +49,8 @@ class FlowDeformation(InvertibleDeformation):
 
     def __init__(
         self, velocity: Velocity, canonical_time: float | None = 0.0, *, velocity_in_time: str = "varying",
-        solver: str = "rk4", num_steps: int = 8, rtol: float = 1e-5, atol: float = 1e-6, gradient: str = "direct",
-        max_steps: int = 1000, corrections: int = 10,
+        solver: str = "rk4", num_steps: int = 8, rtol: float = 1e-5, atol: float = 1e-6, max_steps: int = 1000,
+        corrections: int = 10,
     ) -> None:  # fmt: skip
         super().__init__()
         check_choice("velocity_in_time", velocity_in_time, IN_TIME)
@@ -63,7 +62,7 @@ class FlowDeformation(InvertibleDeformation):
         self.velocity = velocity
         self.canonical_time = canonical_time
         self.velocity_in_time = velocity_in_time
-        self.solver = Solver(solver, num_steps, rtol=rtol, atol=atol, gradient=gradient, max_steps=max_steps)
+        self.solver = Solver(solver, num_steps, rtol=rtol, atol=atol, max_steps=max_steps)
         self.corrections = corrections
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
@@ -106,21 +105,15 @@ class FlowDeformation(InvertibleDeformation):
         right_hand_side = self._right_hand_side(start, spans)
         reached: tuple[float, Tensor] = (0.0, positions)
 
-        def watch(s: float | Tensor, x: Tensor) -> None:
+        def watched(s: float | Tensor, x: Tensor) -> Tensor:
             nonlocal reached
             if self.solver.is_adaptive:
                 reached = (float(torch.as_tensor(s).detach()), x.detach())
-
-        def watched(s: float | Tensor, x: Tensor) -> Tensor:
-            watch(s, x)
             return right_hand_side(s, x)
 
         problem = "positions are not finite"
         try:
-            if self.solver.gradient == "adjoint":
-                result = self.solver.solve_adjoint(_AdjointEquation(self, watch), (positions, start, spans))[0]
-            else:
-                result = self.solver.solve(watched, positions)
+            result = self.solver.solve(watched, positions)
             # A graph that is recorded reads nothing; what is not finite then shows in the loss.
             if _is_recorded(result) or bool(torch.isfinite(result).all()):
                 return result
@@ -147,21 +140,6 @@ class FlowDeformation(InvertibleDeformation):
 
 def _is_recorded(values: Tensor) -> bool:
     return values.is_cuda and torch.cuda.is_current_stream_capturing()
-
-
-class _AdjointEquation(nn.Module):
-    """The flow's equation for (positions, start, spans), so that the adjoint reaches times as well."""
-
-    def __init__(self, flow: FlowDeformation, watch: Callable[[Tensor, Tensor], None]) -> None:
-        super().__init__()
-        self.velocity = flow.velocity
-        self._make = flow._right_hand_side
-        self._watch = watch
-
-    def forward(self, s: Tensor, state: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        positions, start, spans = state
-        self._watch(s, positions)
-        return self._make(start, spans)(s, positions), torch.zeros_like(start), torch.zeros_like(spans)
 
 
 class FlowChain(InvertibleDeformation):

@@ -3,11 +3,10 @@
 With `start` and `end` per point, `dx/ds = (end - start) v(x, start + s (end - start))` runs over s in [0, 1] for all.
 """
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dnerf.core.checks import check_choice, check_positive
 
@@ -16,7 +15,6 @@ FIXED_SOLVERS = {"euler": 1, "midpoint": 2, "rk4": 4}
 
 ADAPTIVE_SOLVERS = ("dopri5", "dopri8", "bosh3", "adaptive_heun")
 SOLVERS = (*FIXED_SOLVERS, *ADAPTIVE_SOLVERS)
-GRADIENTS = ("direct", "adjoint")
 
 RightHandSide = Callable[[float | Tensor, Tensor], Tensor]
 """Derivative (..., 3) to s, of s (a number) and positions (..., 3)."""
@@ -36,12 +34,10 @@ class Solver:
         num_steps: of a fixed-step solver.
         rtol: relative tolerance of an adaptive one.
         atol: absolute tolerance of an adaptive one, in world units. In float32, tolerances below 1e-6 only cost.
-        gradient: "direct" differentiates the solver's steps; "adjoint" solves the adjoint equation backwards, whose
-            memory does not grow with the number of steps (Chen et al. 2018, arXiv 1806.07366, algorithm 1).
         max_steps: of an adaptive solver, accepted and refused ones together, before it gives up.
 
     Raises:
-        ValueError: for an unknown name or gradient, or numbers that are not positive.
+        ValueError: for an unknown name, or numbers that are not positive.
 
     The step size of an adaptive solver is shared by all points. It is controlled by the worst point's error, not by
     torchdiffeq's mean over the batch, which would hide one hard point among ten thousand.
@@ -49,13 +45,12 @@ class Solver:
 
     def __init__(
         self, name: str = "rk4", num_steps: int = 8, *, rtol: float = 1e-5, atol: float = 1e-6,
-        gradient: str = "direct", max_steps: int = 1000,
+        max_steps: int = 1000,
     ) -> None:  # fmt: skip
         check_choice("solver", name, SOLVERS)
-        check_choice("gradient", gradient, GRADIENTS)
         for argument, value in (("num_steps", num_steps), ("rtol", rtol), ("atol", atol), ("max_steps", max_steps)):
             check_positive(argument, value)
-        self.name, self.num_steps, self.gradient = name, num_steps, gradient
+        self.name, self.num_steps = name, num_steps
         self.rtol, self.atol, self.max_steps = rtol, atol, max_steps
 
     @property
@@ -64,38 +59,20 @@ class Solver:
         return self.name in ADAPTIVE_SOLVERS
 
     def solve(self, right_hand_side: RightHandSide, positions: Tensor) -> Tensor:
-        """Positions (..., 3) at s = 1 of those at s = 0; torchdiffeq raises AssertionError where it cannot go on."""
+        """Positions (..., 3) at s = 1 of those at s = 0; torchdiffeq raises AssertionError where it cannot go on.
+
+        Gradients are those of the solver's steps.
+        """
         if not self.is_adaptive:
             return fixed_steps(self.name, right_hand_side, positions, self.num_steps)
         from torchdiffeq import odeint  # with it comes scipy, a fifth of a second that fixed steps need not wait for
 
-        return odeint(right_hand_side, positions, _unit_interval(positions), **self._settings(_worst_point))[-1]
-
-    def solve_adjoint(self, right_hand_side: nn.Module, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """The state at s = 1, with gradients from the adjoint equation to the state and the module's parameters.
-
-        Args:
-            right_hand_side: maps s and the state to the state's derivatives.
-            state: tensors of any shapes, the first (..., 3).
-        """
-        settings = self._settings(lambda parts: _worst_point(parts[0]))
-        from torchdiffeq import odeint_adjoint
-
-        solution = odeint_adjoint(right_hand_side, state, _unit_interval(state[0]), **settings)
-        return tuple(part[-1] for part in solution)
-
-    def _settings(self, norm: Callable[[Any], Tensor]) -> Mapping[str, Any]:
-        if not self.is_adaptive:
-            # A step size would leave a tiny last step where 1 / num_steps rounds down.
-            return {"method": self.name, "options": {"grid_constructor": self._equal_steps}}
-        # Steps end where the way ends (0 is the adjoint's end): torchdiffeq would step past it and interpolate, to
-        # fourth order only, which is all that a loose dopri8 would then be.
-        options = {"norm": norm, "max_num_steps": self.max_steps, "step_t": torch.tensor([0.0, 1.0])}
-        return {"method": self.name, "rtol": self.rtol, "atol": self.atol, "options": options}
-
-    def _equal_steps(self, _: Any, positions: Any, interval: Tensor) -> Tensor:
-        ends = interval[0].item(), interval[-1].item()
-        return torch.linspace(*ends, self.num_steps + 1, dtype=interval.dtype, device=interval.device)
+        # Steps end where the way ends: torchdiffeq would step past it and interpolate, to fourth order only, which is
+        # all that a loose dopri8 would then be.
+        options = {"norm": _worst_point, "max_num_steps": self.max_steps, "step_t": torch.tensor([0.0, 1.0])}
+        interval = torch.tensor([0.0, 1.0], dtype=positions.dtype, device=positions.device)
+        tolerances = {"rtol": self.rtol, "atol": self.atol}
+        return odeint(right_hand_side, positions, interval, method=self.name, options=options, **tolerances)[-1]
 
     def advice(self) -> str:
         """What to change when an integration fails."""
@@ -123,10 +100,6 @@ def _increment(name: str, f: RightHandSide, x: Tensor, s: float, h: float) -> Te
     third = f(s + 2 * h / 3, x + h * (second - first / 3))
     fourth = f(s + h, x + h * (first - second + third))
     return (first + 3 * (second + third) + fourth) / 8
-
-
-def _unit_interval(like: Tensor) -> Tensor:
-    return torch.tensor([0.0, 1.0], dtype=like.dtype, device=like.device)
 
 
 def _worst_point(values: Tensor) -> Tensor:

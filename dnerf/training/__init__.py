@@ -3,7 +3,7 @@
 from dnerf.training.averaging import WeightAverage
 from dnerf.training.callbacks import BoxWarning, Callback, ProgressBar
 from dnerf.training.checkpoint_folder import CheckpointFolder, Checkpoints
-from dnerf.training.logging import JsonLinesLog, Previews, TensorBoardLog
+from dnerf.training.logging import JsonLinesLog, Previews
 from dnerf.training.optimizer import AdamMuon, AdamSettings
 from dnerf.training.records import TrainingRecord
 from dnerf.training.recovery import Recovery
@@ -13,6 +13,5 @@ from dnerf.training.trainer import Trainer
 
 __all__ = [
     "AdamMuon", "AdamSettings", "BoxWarning", "Callback", "CheckpointFolder", "Checkpoints", "JsonLinesLog",
-    "Previews", "ProgressBar", "Recovery", "Run", "TensorBoardLog", "Trainer", "TrainingRecord", "TrainingStopped",
-    "WeightAverage",
+    "Previews", "ProgressBar", "Recovery", "Run", "Trainer", "TrainingRecord", "TrainingStopped", "WeightAverage",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Logs of a training run: JSON lines, preview images, TensorBoard."""
+"""Logs of a training run: JSON lines and preview images."""
 
 import errno
 import json
@@ -93,40 +93,3 @@ class Previews(Callback):
         score, prediction, truth = scores[0]
         sheet = comparison_sheet([(prediction, truth)], [f"step {run.step}: {score.psnr:.2f} dB"])
         write_png(sheet, self._folder / f"step_{run.step:07d}.png")
-
-
-class TensorBoardLog(Callback):
-    """Writes every training record's numbers as TensorBoard scalars into `tensorboard/` of the run's folder.
-
-    Raises:
-        ValueError: if the extra "tensorboard" is not installed.
-    """
-
-    _writer: Any = None
-
-    def __init__(self) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise ValueError("TensorBoardLog needs the extra: pip install 'dnerf[tensorboard]'") from error
-        self._make = SummaryWriter
-
-    def on_train_begin(self, run: Run) -> None:
-        """Open the files."""
-        self._writer = self._make(str(run.folder_for(self) / "tensorboard"))
-
-    def on_step_end(self, run: Run) -> None:
-        """Write a record."""
-        record = run.record
-        if record is None or self._writer is None:
-            return
-        sizes = {"rays_per_step": record.num_rays, "samples_per_step": record.num_samples}
-        losses = {f"loss/{name}": value for name, value in record.losses.items()}
-        for name, value in {**losses, "psnr": record.psnr, **sizes}.items():
-            self._writer.add_scalar(name, value, record.step)
-        self._writer.flush()
-
-    def on_train_end(self, run: Run) -> None:
-        """Close the files."""
-        if self._writer is not None:
-            self._writer.close()

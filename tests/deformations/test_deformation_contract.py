@@ -17,7 +17,7 @@ from dnerf.deformations import (
     InvertibleDeformation,
     SE3Deformation,
 )
-from dnerf.deformations.velocities import CurlVelocity, NetworkVelocity, RigidVelocity
+from dnerf.deformations.velocities import NetworkVelocity
 
 BOX = ((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
 
@@ -43,13 +43,10 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
     "se3": lambda: SE3Deformation(2, 16, (), position_frequencies=2, canonical_time=None),
     "se3, canonical time": lambda: SE3Deformation(2, 16, (), position_frequencies=2),
     "flow": lambda: FlowDeformation(network_velocity(), 0.5),
-    "flow, adjoint": lambda: FlowDeformation(network_velocity(), num_steps=4, gradient="adjoint"),
     "flow, stationary velocity": lambda: FlowDeformation(
         network_velocity(), None, velocity_in_time="stationary", solver="midpoint", num_steps=1
     ),
     "flow, time embeddings": lambda: FlowDeformation(NetworkVelocity(BOX, 2, 16, time_embeddings=5), num_steps=4),
-    "flow, curl": lambda: FlowDeformation(CurlVelocity(BOX, 4, 8, max_wavenumber=0.5, time_frequencies=2), num_steps=4),
-    "flow, rigid": lambda: FlowDeformation(RigidVelocity(BOX, 3, 8, time_frequencies=2), num_steps=4),
     "flows in a row": lambda: FlowChain(
         {
             name: FlowDeformation(network_velocity(), None, velocity_in_time="stationary", solver="euler", num_steps=1)

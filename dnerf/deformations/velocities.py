@@ -1,4 +1,4 @@
-"""What a velocity field is, and how it fades to zero at the faces of a box."""
+"""Velocity fields of flows, and how they fade to zero at the faces of a box."""
 
 import math
 from abc import abstractmethod
@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive
+from dnerf.nn.encodings import SinusoidalEncoding, TimeEncoding
+from dnerf.nn.mlp import MLP
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup, network_groups
 
 
@@ -65,16 +67,6 @@ class BoxWindow(nn.Module):
         center, reach = self.center.to(positions.dtype), self.reach.to(positions.dtype)
         return positions.clamp(center - reach, center + reach)
 
-    def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Factor (..., 1) and its gradient (..., 3) to the position, differentiable both."""
-        depth = self._depth(positions)
-        x, y, z = self._steps(depth).unbind(-1)
-        inside = ((depth > 0) & (depth < 1)).to(depth.dtype)
-        slopes = -torch.sign(positions - self.center.to(positions.dtype)) * self.slope.to(positions.dtype) * inside
-        along = self._step_slopes(depth) * slopes
-        others = torch.stack([y * z, x * z, x * y], dim=-1)
-        return (x * y * z)[..., None], along * others
-
     def _depth(self, positions: Tensor) -> Tensor:
         """Distance from the faces in units of the fading layer, clamped to [0, 1]; (..., 3)."""
         dtype = positions.dtype
@@ -82,11 +74,6 @@ class BoxWindow(nn.Module):
 
     def _steps(self, depth: Tensor) -> Tensor:
         return depth ** (len(self.coefficients)) * _horner(depth, self.coefficients)
-
-    def _step_slopes(self, depth: Tensor) -> Tensor:
-        first = len(self.coefficients)
-        scaled = [c * (first + k) for k, c in enumerate(self.coefficients)]
-        return depth ** (first - 1) * _horner(depth, scaled)
 
 
 def smooth_step_coefficients(smoothness: int) -> list[float]:
@@ -103,3 +90,60 @@ def _horner(x: Tensor, coefficients: Sequence[float]) -> Tensor:
     for c in reversed(coefficients[:-1]):
         value = value * x + c
     return value
+
+
+class NetworkVelocity(Velocity):
+    """v(x, t) = w(x) MLP(x, t), w the window of the box; zero everywhere at initialisation.
+
+    Where a solver looks several times at the same times (`at`), those are encoded once.
+
+    Args:
+        box: (2, 3) corners outside of which nothing moves, in world units.
+        num_layers: hidden layers, >= 1.
+        hidden_features: their width.
+        position_frequencies: octaves of the positions' encoding.
+        time_frequencies: octaves of the times' encoding.
+        activation: of the hidden layers; "silu" is smooth, so that solvers keep their order, "relu" is cheaper.
+        fade, smoothness: see `BoxWindow`.
+        window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
+        time_embeddings: learnt embeddings of time, half as many as frames at most (`TimeEncoding`); 0 for none.
+        embedding_features: how many of each.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
+
+    def __init__(
+        self, box: Sequence[Sequence[float]], num_layers: int = 3, hidden_features: int = 64, *,
+        position_frequencies: int = 3, time_frequencies: int = 5, activation: str = "silu", fade: float = 0.1,
+        smoothness: int = 4, window_end: float | None = None, time_embeddings: int = 0, embedding_features: int = 4,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        check_positive("num_layers", num_layers)
+        self.window = BoxWindow(box, fade, smoothness)
+        self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
+        self.encode_times = TimeEncoding(time_frequencies, time_embeddings, embedding_features)
+        self.mlp = MLP(
+            self.encode_positions.out_features + self.encode_times.out_features, hidden_features, num_layers,
+            out_features=3, zero_output=True, activation=activation,
+        )  # fmt: skip
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Velocity (..., 3) at positions (..., 3) and times (...,)."""
+        return self.at(times)(positions)
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """The last layer in "deformation_output", the rest in "deformation"."""
+        return network_groups(self, "deformation", self.mlp.output)
+
+    def at(self, times: Tensor) -> Callable[[Tensor], Tensor]:
+        """The field at fixed times."""
+        of_times = self.encode_times(times[..., None])
+
+        def velocity(positions: Tensor) -> Tensor:
+            inside = self.window.inside(positions)
+            inputs = torch.cat([*self.encode_positions.parts(inside), of_times], dim=-1)
+            motion = self.mlp(inputs).to(positions.dtype)
+            return self.window(positions) * motion
+
+        return velocity
