@@ -43,7 +43,7 @@ class EikonalLoss(Loss):
     """
 
     def __init__(
-        self, box: Sequence[Sequence[float]], weight: float | Schedule = 0.1, num_points: int = 512, *, every: int = 1
+        self, box: Sequence[Sequence[float]], weight: float | Schedule = 1e-2, num_points: int = 256, *, every: int = 1
     ) -> None:
         super().__init__(weight, every=every)
         check_whole("num_points", num_points)
