@@ -26,4 +26,4 @@ def scene_overrides(scene: str, resolution: int, data_root: str | None, quick: b
             f"scene must be one of {', '.join(sorted(SCENES))} or a folder below data_root (DNERF_DATA), "
             f"got {scene!r} and data_root={data_root!r}"
         )
-    return ["data=blender", f"data.root={folder}", f"data.resolution={resolution}"]
+    return ["data=auto", f"data.root={folder}", f"data.resolution={resolution}"]
