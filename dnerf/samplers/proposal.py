@@ -26,12 +26,13 @@ class ProposalSampler(Sampler, Scheduled):
     bounds of the field's, `Samples.bounds`. No gradient goes through where samples lie, or from proposals to rays.
 
     While proposals know little, weights w are annealed to w^a by Schlick's bias, a = 10 p / (1 + 9 p), p the share of
-    `anneal_end` that is done; they learn in every step. Later they learn in every `learn_every`-th. In all other steps,
-    and in images, intervals are left out where the last proposal's bound is at most `min_weight`: samples are packed.
+    `anneal_end` that is done.
 
-    Source: mip-NeRF 360 (arXiv 2111.12077) section 3, annealing from its appendix; fewer lessons from nerfacc (arXiv
-    2305.04966). Deviations: even in distance, not in disparity; a share of samples is even, in place of dilated
-    histograms; what bounds exclude is left out.
+    Images leave out intervals where the last proposal's bound is at most `min_weight`; their samples are packed.
+    Training leaves out none: what a proposal wrongly excludes must be seen to be missed.
+
+    Source: mip-NeRF 360 (arXiv 2111.12077) section 3, annealing from its appendix. Deviations: even in distance, not
+    in disparity; a share of samples is even, in place of dilated histograms; images leave out what bounds exclude.
 
     Args:
         proposals: density fields, coarse to fine, which may depend on time.
@@ -41,8 +42,6 @@ class ProposalSampler(Sampler, Scheduled):
         anneal_end: fraction of training, in [0, 1], until which weights are annealed.
         even_share: of the samples of an opaque ray, drawn evenly, in [0, 1): what proposals have lost is found again.
         min_weight: see above, in [0, 1); 0 leaves nothing out.
-        learn_every: steps from one lesson to the next.
-        pad_to: in training, packed samples are rounded up to a multiple of this, see `Samples.padded`.
 
     Raises:
         ValueError: for numbers out of range, no proposal, or not a number of intervals for each.
@@ -53,7 +52,7 @@ class ProposalSampler(Sampler, Scheduled):
     def __init__(
         self, proposals: Sequence[RadianceField], num_proposed: Sequence[int] = (64, 48), num_samples: int = 32, *,
         box: Sequence[Sequence[float]] | Tensor | None = None, anneal_end: float = 0.1, even_share: float = 0.05,
-        min_weight: float = 1e-3, learn_every: int = 5, pad_to: int = 2048,
+        min_weight: float = 1e-3,
     ) -> None:  # fmt: skip
         super().__init__()
         if not len(proposals) or len(proposals) != len(num_proposed):
@@ -61,9 +60,7 @@ class ProposalSampler(Sampler, Scheduled):
                 f"num_proposed must hold a number for each of at least one proposal, got {list(num_proposed)} "
                 f"for {len(proposals)}"
             )
-        counts = [("num_proposed", count) for count in num_proposed]
-        counts += [("num_samples", num_samples), ("learn_every", learn_every), ("pad_to", pad_to)]
-        for name, count in counts:
+        for name, count in (*(("num_proposed", count) for count in num_proposed), ("num_samples", num_samples)):
             check_whole(name, count)
         if not 0 <= anneal_end <= 1:
             raise ValueError(f"anneal_end must be in [0, 1], got {anneal_end}")
@@ -74,45 +71,34 @@ class ProposalSampler(Sampler, Scheduled):
         self.num_proposed, self.num_samples = tuple(num_proposed), num_samples
         self.box = None if box is None else nn.Buffer(as_box(box), persistent=False)
         self.anneal_end, self.even_share, self.min_weight = anneal_end, even_share, min_weight
-        self.learn_every, self.pad_to = learn_every, pad_to
-        self.is_learning = True
         self.set_progress(0.0)
 
     def set_progress(self, progress: float) -> None:
         """Trust weights as far as training stands, `progress` in [0, 1]; images trust them in full."""
         share = 1.0 if progress >= self.anneal_end else progress / self.anneal_end
         self.training_power = 10 * share / (1 + 9 * share)
-        self.is_annealing = progress < self.anneal_end
-
-    def update(self, field: RadianceField, step: int) -> None:
-        """Decide whether proposals learn in the next step; nothing is learnt from the field itself."""
-        self.is_learning = self.is_annealing or (step + 1) % self.learn_every == 0
 
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
-        """Samples (R, num_samples), with bounds where proposals learn; else packed ones, of those that they allow."""
+        """Samples (R, num_samples), with bounds; in images packed ones, of those that the last bound allows."""
         near, far = rays.near.detach(), torch.maximum(rays.near, rays.far).detach()
         if self.box is not None:
             corners = self.box.to(near.dtype)
             near, far = clip_to_box(rays.origins.detach(), rays.directions.detach(), near, far, corners)
         edges, weights = torch.stack([near, far], dim=-1), torch.ones_like(near)[:, None]
         levels = []
-        is_learning = self.training and self.is_learning
         for proposal, count in zip(self.proposals, self.num_proposed):
             edges = self._drawn(edges, weights, count, generator)
-            with torch.set_grad_enabled(is_learning and torch.is_grad_enabled()):
-                weights = self._weights(cast(RadianceField, proposal), rays, edges)
+            weights = self._weights(cast(RadianceField, proposal), rays, edges)
             levels.append((edges, weights))
         edges = self._drawn(edges, weights, self.num_samples, generator)
         starts, ends = edges[:, :-1], edges[:, 1:]
-        points = random_points(starts, ends, generator) if self.training else None
-        if is_learning:
+        if self.training:
             bounds = tuple(outer_bound(edges, *level) for level in levels)
-            return Samples(starts, ends, len(rays), points=points, bounds=bounds)
-        samples = Samples(starts, ends, len(rays), points=points)
+            return Samples(starts, ends, len(rays), points=random_points(starts, ends, generator), bounds=bounds)
+        samples = Samples(starts, ends, len(rays))
         if not self.min_weight:
             return samples
-        packed = samples.packed(~(outer_bound(edges, *levels[-1]) <= self.min_weight))  # NaN stays
-        return packed.padded(self.pad_to) if self.training else packed
+        return samples.packed(~(outer_bound(edges, *levels[-1]) <= self.min_weight))  # NaN stays
 
     def _drawn(self, edges: Tensor, weights: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
         """Edges (R, count + 1) of intervals of about the same weight each, from the first edge to the last."""

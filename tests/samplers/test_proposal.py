@@ -159,27 +159,18 @@ def test_empty_and_short_rays_have_finite_losses_and_gradients(counts: tuple[int
     assert all(p.grad.isfinite().all() for p in model.parameters() if p.grad is not None)
 
 
-def test_between_its_lessons_and_in_images_what_no_proposal_allows_is_left_out() -> None:
+def test_images_leave_out_what_no_proposal_allows() -> None:
     """By at most `min_weight` for each interval, where bounds hold as here."""
     ball, rays = soft_ball(width=0.2), rays_towards_origin(50, torch.float64)
-    sampler = ProposalSampler([soft_ball(width=0.3)], (64,), 32, min_weight=1e-3, learn_every=4, pad_to=1)
+    sampler = ProposalSampler([soft_ball(width=0.3)], (64,), 32, min_weight=1e-3)
     model = Renderer(ball, sampler).eval()
-    sampler.set_progress(1.0)
     kept = model(rays)
     sampler.min_weight = 0.0
     everything = model(rays)
     assert kept.samples.is_packed
     assert len(kept.weights) < 0.8 * everything.weights.numel()
     assert 0 < (kept.opacity - everything.opacity).abs().max() < 32e-3
-    sampler.min_weight = 1e-3
-    model.train()
-    for step, is_lesson in ((2, False), (3, True), (4, False), (7, True)):
-        model.update(step)
-        samples = model(rays).samples
-        assert (len(samples.bounds), samples.is_packed) == ((1, False) if is_lesson else (0, True))
-    sampler.set_progress(0.0)  # proposals that know nothing learn in every step
-    model.update(2)
-    assert model(rays).samples.bounds
+    assert not model.train()(rays).samples.is_packed
 
 
 def test_the_loss_asks_for_a_sampler_with_bounds() -> None:
@@ -193,7 +184,6 @@ def test_the_loss_asks_for_a_sampler_with_bounds() -> None:
     ({"num_proposed": (8, 8)}, "num_proposed must hold"), ({"num_proposed": (0,)}, "num_proposed must be > 0"),
     ({"num_samples": 1.5}, "num_samples must be a whole"), ({"anneal_end": 1.5}, r"anneal_end must be in \[0, 1\]"),
     ({"even_share": 1.0}, r"even_share must be in \[0, 1\)"), ({"min_weight": -0.1}, "min_weight must be in"),
-    ({"learn_every": 0}, "learn_every must be > 0"),
 ])  # fmt: skip
 def test_settings_out_of_range_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
