@@ -24,7 +24,7 @@ Method = Callable[[RadianceField, Rays, int], Tensor]
 
 THEORY = {
     "constant": 2.0, "left edge": 2.0, "stratified": 1.5, "stratified, linear": 1.5, "linear": 2.0, "parabolic": 4.0,
-    "importance": 2.0, "importance, linear": 2.0, "occupancy": 2.0,
+    "importance": 2.0, "occupancy": 2.0,
 }  # fmt: skip
 """Orders of convergence on smooth density that vanishes at both ends of a ray."""
 EDGES = 1.0
@@ -92,13 +92,10 @@ def methods(field: RadianceField, quick: bool = False) -> dict[str, Method]:
 
         return call
 
-    def importance(rule: str, draws: str) -> Method:
-        def call(field: RadianceField, rays: Rays, count: int) -> Tensor:
-            half = max(2, count // 2)
-            sampler = ImportanceSampler(half, count - half, box=field.box, quadrature=draws).eval()  # type: ignore[arg-type]
-            return _composite(field, rays, sampler(rays, field), rule)
-
-        return call
+    def importance(field: RadianceField, rays: Rays, count: int) -> Tensor:
+        half = max(2, count // 2)
+        sampler = ImportanceSampler(half, count - half, box=field.box).eval()  # type: ignore[arg-type]
+        return _composite(field, rays, sampler(rays, field), "constant")
 
     found: dict[str, Method] = {
         "constant": equal("constant"),
@@ -107,8 +104,7 @@ def methods(field: RadianceField, quick: bool = False) -> dict[str, Method]:
         "stratified, linear": equal("linear", training=True),
         "linear": equal("linear"),
         "parabolic": equal("parabolic"),
-        "importance": importance("constant", "constant"),
-        "importance, linear": importance("linear", "linear"),
+        "importance": importance,
     }
     box = field.box.tolist()  # type: ignore[operator]
     grid = OccupancyGrid(box, 16 if quick else 40, num_slabs=4 if quick else 16, threshold=1e-3)
@@ -235,7 +231,7 @@ def _findings(name: str, rows: list[dict[str, Any]], counts: list[int]) -> list[
     midpoints = counts[-2]
     target = next(r["rms_error"] for r in rows if r["method"] == "constant" and r["samples_per_ray"] == midpoints)
     reached, never = [], []
-    for method in ("parabolic", "linear", "importance", "importance, linear", "occupancy", "stratified, linear"):
+    for method in ("parabolic", "linear", "importance", "occupancy", "stratified, linear"):
         needed = samples_needed([r for r in rows if r["method"] == method], target)
         if math.isfinite(needed):
             reached.append(f"`{method}` {needed / midpoints:.2f}")

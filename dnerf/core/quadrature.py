@@ -7,10 +7,9 @@ interval's end.
 
 - "constant": density and colour of the sample hold all over its interval. Midpoint rule, second order.
 - "linear": density is linear between samples (PL-NeRF, arXiv 2310.20685, eqs. 5-8), and the optical depth its exact
-  integral; its CDF inverts in closed form (`sample_piecewise_linear`). Second order as well: on smooth density its
-  optical depth errs twice as much as the midpoint rule's, the other way (trapezia against midpoints). It gains where
-  samples do not lie in the middle, as in stratified training. Deviation: colour belongs to the nearest sample rather
-  than to the segment between two.
+  integral. Second order as well: on smooth density its optical depth errs twice as much as the midpoint rule's, the
+  other way (trapezia against midpoints). It gains where samples do not lie in the middle, as in stratified training.
+  Deviation: colour belongs to the nearest sample rather than to the segment between two.
 - "parabolic": the parabola through a sample and its neighbours. With h the length of an interval of equal ones, its
   optical depth is h (s_-  + 22 s + s_+) / 24, its colour the mean of the three with weights (s_-, 22 s, s_+), shifted
   towards the eye by the distance between the interval's middle and the centroid of the light absorbed in it. Fourth
@@ -24,7 +23,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dnerf.core.checks import check_choice, check_positive, check_shape
+from dnerf.core.checks import check_choice, check_shape
 from dnerf.core.rays import Samples
 
 RULES = ("constant", "linear", "parabolic")
@@ -164,55 +163,3 @@ def _centroid_shift(depth: Tensor) -> Tensor:
     series = x / 12 * (1 - x * x / 60 * (1 - x * x / 42))
     y = torch.where(thin, 1.0, depth)
     return torch.where(thin, series, 0.5 - 1 / y + torch.exp(-y) / -torch.expm1(-y))
-
-
-def sample_piecewise_linear(
-    points: Tensor, density: Tensor, num_samples: int, *, randomized: bool = False,
-    generator: torch.Generator | None = None,
-) -> Tensor:  # fmt: skip
-    """Draw sorted distances from the light absorbed where density is linear between points (PL-NeRF, eqs. 9-10).
-
-    The CDF 1 - exp(-u(t)) has a piecewise quadratic optical depth u(t); its inverse is a quadratic's stable root. Rays
-    that absorb nothing are sampled uniformly. No gradient flows.
-
-    Args:
-        points: (R, S) sorted distances, S >= 2.
-        density: (R, S) there, >= 0.
-        num_samples: distances per ray.
-        randomized: one uniform number in each of `num_samples` strata; their middles otherwise.
-        generator: source of randomness.
-
-    Returns:
-        (R, num_samples) sorted distances between the first and the last point.
-
-    Raises:
-        ValueError: if shapes do not fit.
-    """
-    check_positive("num_samples", num_samples)
-    check_shape("density", density, ("R", "S"))
-    check_shape("points", points, tuple(density.shape))
-    points, density = points.detach(), density.detach().clamp(max=OPAQUE)
-    steps = points.diff(dim=-1)
-    depth = (0.5 * density[:, :-1] + 0.5 * density[:, 1:]) * steps
-    total = torch.cat([torch.zeros_like(depth[:, :1]), depth.cumsum(-1)], dim=-1)
-    strata = torch.arange(num_samples, dtype=depth.dtype, device=depth.device).expand(len(depth), num_samples)
-    within = torch.full_like(total[:, :1], 0.5)
-    if randomized:
-        within = torch.rand(strata.shape, generator=generator, dtype=depth.dtype, device=depth.device)
-    u = ((strata + within) / num_samples).clamp(max=1 - torch.finfo(depth.dtype).eps / 2)
-    last = total[:, -1:]
-    # -log1p(-u (1 - exp(-last))): as exact for thin rays as for opaque ones.
-    wanted = torch.minimum(-torch.log1p(u * torch.expm1(-last)), last).contiguous()
-    index = (torch.searchsorted(total.contiguous(), wanted, right=True) - 1).clamp(0, depth.shape[1] - 1)
-    low, high = density.gather(-1, index), density.gather(-1, index + 1)
-    step, start = steps.gather(-1, index), points.gather(-1, index)
-    left = (wanted - total.gather(-1, index)).clamp(min=0)
-    slope = torch.where(step > 0, (high - low) / torch.where(step > 0, step, 1.0), 0.0)
-    # Dividing by a scale keeps squares of densities from overflowing.
-    scale = torch.maximum(low, high).clamp(min=1e-30)
-    root = ((low / scale).square() + 2 * (slope / scale) * (left / scale)).clamp(min=0).sqrt()
-    divisor = low / scale + root
-    moved = torch.where(divisor > 0, 2 * (left / scale) / torch.where(divisor > 0, divisor, 1.0), 0.0)
-    drawn = start + torch.minimum(moved, step)
-    uniform = torch.lerp(points[:, :1], points[:, -1:], u)
-    return torch.where(last > 1e-12, drawn, uniform).cummax(dim=-1).values

@@ -1,13 +1,11 @@
 """Hierarchical importance sampling: a coarse pass tells where the fine samples go."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from dnerf.core.checks import check_choice, check_positive
+from dnerf.core.checks import check_positive
 from dnerf.core.compositing import FieldOutput, render_weights
-from dnerf.core.quadrature import interval_depths, sample_piecewise_linear
+from dnerf.core.quadrature import interval_depths
 from dnerf.core.rays import Rays, Samples
 from dnerf.fields.base import RadianceField
 from dnerf.samplers.base import Sampler
@@ -27,21 +25,17 @@ class ImportanceSampler(Sampler):
         num_fine: edges drawn per ray; the fine pass has `num_coarse + num_fine` intervals.
         proposal: the coarse network, or None for a shared one.
         box: (2, 3), outside which nothing is sampled; None for no limit.
-        quadrature: "constant" draws from a histogram of the coarse weights; "linear" from coarse density that is linear
-            between samples, by the closed form of PL-NeRF (arXiv 2310.20685).
 
     Raises:
-        ValueError: if a number is not positive, or for another quadrature.
+        ValueError: if a number is not positive.
     """
 
     def __init__(
         self, num_coarse: int = 64, num_fine: int = 64, proposal: RadianceField | None = None, *,
-        box: Tensor | None = None, quadrature: str = "constant",
+        box: Tensor | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         check_positive("num_fine", num_fine)
-        check_choice("quadrature", quadrature, ("constant", "linear"))
-        self.quadrature = quadrature
         self.coarse = StratifiedSampler(num_coarse, box)
         self.num_fine = num_fine
         self.proposal = proposal
@@ -51,15 +45,8 @@ class ImportanceSampler(Sampler):
         coarse = self.coarse(rays, field, generator=generator)
         density, proposals = self._coarse_pass(rays, coarse, field)
         edges = torch.cat([coarse.starts, coarse.ends[:, -1:]], dim=-1)
-        random: dict[str, Any] = {"randomized": self.training, "generator": generator}
-        if self.quadrature == "linear":
-            # Density is held from the ray's ends to the first and last sample.
-            points = torch.cat([edges[:, :1], coarse.distances, edges[:, -1:]], dim=-1)
-            held = torch.cat([density[:, :1], density, density[:, -1:]], dim=-1)
-            drawn = sample_piecewise_linear(points, held, self.num_fine, **random)
-        else:
-            weights = render_weights(interval_depths(density.detach(), coarse.lengths), coarse)
-            drawn = sample_piecewise_constant(edges, weights, self.num_fine, **random)
+        weights = render_weights(interval_depths(density.detach(), coarse.lengths), coarse)
+        drawn = sample_piecewise_constant(edges, weights, self.num_fine, randomized=self.training, generator=generator)
         merged = torch.cat([edges, drawn], dim=-1).sort(dim=-1).values
         starts, ends = merged[:, :-1], merged[:, 1:]
         within = random_points(starts, ends, generator) if self.training else None

@@ -1,4 +1,4 @@
-"""Rules for density between samples: closed forms, orders of convergence, invariances, the inverse CDF."""
+"""Rules for density between samples: closed forms, orders of convergence, invariances."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchmarks.timing import fitted_order
 from dnerf.core.compositing import FieldOutput, Rendering, composite
-from dnerf.core.quadrature import RULES, optical_depths, sample_piecewise_linear
+from dnerf.core.quadrature import RULES, optical_depths
 from dnerf.core.rays import Samples
 
 DOUBLE = torch.float64
@@ -162,36 +162,6 @@ def test_float32_agrees_with_float64(rule: str) -> None:
     # Lengths are differences of distances near 10, known to 1e-6, of which the shortest part is 1e-2 or so.
     assert ((rounded.opacity.double() - exact.opacity).abs() / exact.opacity).max() < 2e-5
     assert (rounded.rgb.double() - exact.rgb).abs().max() < 2e-5
-
-
-@given(seed=st.integers(0, 2**31), scale=st.sampled_from([1e-9, 1e-3, 1.0, 1e3, 1e20]), randomized=st.booleans())
-def test_draws_from_linear_density_invert_their_cdf(seed: int, scale: float, randomized: bool) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    points = (0.05 + torch.rand(60, 9, generator=generator, dtype=DOUBLE)).cumsum(-1)
-    density = scale * torch.rand(60, 9, generator=generator, dtype=DOUBLE)
-    density = density * (torch.rand(60, 9, generator=generator) > 0.2)
-    density[:, 4] += scale
-    drawn = sample_piecewise_linear(points, density, 25, randomized=randomized, generator=generator)
-    assert (drawn.diff(dim=-1) >= 0).all()
-    assert (drawn >= points[:, :1]).all()
-    assert (drawn <= points[:, -1:]).all()
-    if randomized:
-        return
-    segments = points.diff(dim=-1)
-    offset = (drawn[..., None] - points[:, None, :-1]).clamp(min=0).minimum(segments[:, None])
-    slope = density.diff(dim=-1) / segments
-    depth = (density[:, None, :-1] * offset + 0.5 * slope[:, None] * offset**2).sum(-1)
-    total = (0.5 * (density[:, :-1] + density[:, 1:]) * segments).sum(-1, keepdim=True)
-    u = (torch.arange(25, dtype=DOUBLE) + 0.5) / 25
-    # What is measured is optical depth: scale times the rounding of a distance near 5.
-    expected = -torch.log1p(u * torch.expm1(-total))
-    assert ((depth - expected).abs() <= 1e-9 * expected + 1e-14 * scale).all()
-
-
-def test_rays_without_light_are_sampled_uniformly() -> None:
-    points = torch.linspace(1, 3, 5).expand(2, 5)
-    drawn = sample_piecewise_linear(points, torch.zeros(2, 5), 4)
-    torch.testing.assert_close(drawn[0], torch.tensor([1.25, 1.75, 2.25, 2.75]))
 
 
 @pytest.mark.parametrize("rule", RULES)

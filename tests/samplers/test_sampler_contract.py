@@ -28,7 +28,6 @@ SAMPLERS: dict[str, Callable[[], Sampler]] = {
     "importance, own proposal": lambda: ImportanceSampler(8, 12, soft_ball(width=0.6)),
     "occupancy, all of a box": lambda: occupancy_sampler(BOX.tolist(), 0.1, 8, num_slabs=4),
     "occupancy, filled": filled_occupancy,
-    "importance, linear": lambda: ImportanceSampler(8, 12, box=BOX, quadrature="linear"),
     "proposal": lambda: ProposalSampler([soft_ball(width=0.6), soft_ball()], (8, 8), 8),
     "proposal, one interval": lambda: ProposalSampler([soft_ball()], (1,), 1),
     "proposal in a box": lambda: ProposalSampler([soft_ball()], (8,), 8, box=BOX, min_weight=0.0),
@@ -199,7 +198,7 @@ def test_other_samplers_hold_distances_fixed(name: str, training: bool) -> None:
         origins = rays.origins.clone().requires_grad_()
         shown(name, replace(rays, origins=origins), training, samples).sum().backward()
         found.append(origins.grad)
-    if name in ("importance, linear", "importance in a box"):  # whose coarse edges end where the box does
+    if name == "importance in a box":  # whose coarse edges end where the box does
         assert not torch.equal(*found)
         return
     torch.testing.assert_close(*found, rtol=0, atol=1e-12)
