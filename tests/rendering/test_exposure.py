@@ -7,7 +7,6 @@ import torch
 from torch import nn
 
 from dnerf.core.cameras import Camera, Intrinsics, look_at
-from dnerf.core.rays import Rays
 from dnerf.rendering import Exposure, Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
@@ -23,9 +22,8 @@ def drifting(factors: list[list[float]]) -> Exposure:
 
 def test_colours_are_as_they_are_at_first_and_gradients_flow() -> None:
     exposure, rgb = Exposure(), torch.rand(41, 3)
-    shown = exposure(rgb, TIMES)
-    torch.testing.assert_close(shown, rgb, rtol=0, atol=0)
-    (shown * (TIMES[:, None] - 0.5)).sum().backward()
+    torch.testing.assert_close(exposure(rgb, TIMES), rgb, rtol=0, atol=0)
+    (exposure(rgb, TIMES) * (TIMES[:, None] - 0.5)).sum().backward()
     assert exposure.logarithms.grad is not None
     assert float(exposure.logarithms.grad.abs().max()) > 0.1
 
@@ -39,8 +37,8 @@ def test_logarithms_of_factors_are_linear_between_times() -> None:
 
 def test_brightness_as_a_whole_is_the_scene_s() -> None:
     factors = torch.rand(7, 3) + 0.5
-    rgb, times = torch.rand(41, 3), TIMES
-    torch.testing.assert_close(drifting(factors.tolist())(rgb, times), drifting((3 * factors).tolist())(rgb, times))
+    shown, brighter = (drifting(x.tolist())(torch.full((41, 3), 0.5), TIMES) for x in (factors, 3 * factors))
+    torch.testing.assert_close(shown, brighter)
 
 
 def test_its_derivatives_are_right() -> None:
@@ -76,8 +74,7 @@ def test_it_is_in_training_and_not_in_images() -> None:
     exposed = Renderer(make_scene("static"), StratifiedSampler(16), exposure=exposure)
     camera = Camera(Intrinsics.from_angle(4, 4, 0.7), look_at((4.0, 0.0, 0.0)))
     assert torch.equal(exposed.render_image(camera, 0.0).rgb, plain.render_image(camera, 0.0).rgb)
-    rays: Rays = camera.rays(0.0)
-    seen = [model(rays, generator=torch.Generator().manual_seed(0)).rgb for model in (exposed, plain)]
+    seen = [model(camera.rays(0.0), generator=torch.Generator().manual_seed(0)).rgb for model in (exposed, plain)]
     torch.testing.assert_close(seen[0], seen[1] * torch.tensor([2.0, 1.0, 0.5]))
 
 
