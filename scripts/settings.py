@@ -94,6 +94,10 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
         "split": SPLIT, "frame": COUNT, "start": NUMBER.or_null(), "spacing": POSITIVE, "every": POSITIVE,
         "trail": COUNT, "format": TEXT, "resolution": POSITIVE.or_null(), "chunk": POSITIVE.or_null(),
     },
+    "mesh": {
+        "format": SEVERAL, "time": NUMBER.or_null(), "resolution": POSITIVE, "level": NUMBER.or_null(),
+        "min_share": NUMBER, "close_gaps": NUMBER, "key_every": POSITIVE, "interpolation": TEXT,
+    },
     "make_dataset": {
         "out": TEXT, "film": TEXT.or_null(), "num_val": POSITIVE, "num_test": POSITIVE, "resolution": POSITIVE,
     },

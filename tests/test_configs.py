@@ -182,7 +182,7 @@ def test_blender_data_reads_what_make_dataset_writes(tmp_path: Path) -> None:
     assert difference.abs().max() <= 1
 
 
-@pytest.mark.parametrize("script", ["benchmark", "evaluate", "make_dataset", "render", "report", "tracks"])
+@pytest.mark.parametrize("script", ["benchmark", "evaluate", "make_dataset", "mesh", "render", "report", "tracks"])
 def test_script_configs_compose(script: str) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for path in names("path") if script == "render" else [None]:

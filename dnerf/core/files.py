@@ -3,7 +3,8 @@
 import json
 import os
 import secrets
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,27 @@ def _flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+@contextmanager
+def replaced_folder(path: Path, is_own: Callable[[str], bool]) -> Iterator[Path]:
+    """Yield a temporary folder that becomes `path` when the block ends well, and vanishes otherwise.
+
+    Raises:
+        ValueError: if there is something at `path` already, beside a folder that holds only files whose names are its
+            own.
+    """
+    path = Path(os.path.abspath(path))
+    if os.path.lexists(path) and not (path.is_dir() and all(is_own(file.name) for file in path.iterdir())):
+        raise ValueError(f"path must be a new folder or one of earlier frames, got {path}, which holds other things")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        unfinished, replaced = Path(folder) / "unfinished", Path(folder) / "replaced"
+        unfinished.mkdir()
+        yield unfinished
+        if path.is_dir():
+            path.rename(replaced)
+        unfinished.rename(path)
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -2,8 +2,6 @@
 
 import itertools
 import math
-import os
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -16,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor, nn
 
 from dnerf.core.checks import check_choice, check_positive
-from dnerf.core.files import atomic_path
+from dnerf.core.files import atomic_path, replaced_folder
 from dnerf.visualization.colours import error_map
 
 FORMATS = ("mp4", "gif", "png")
@@ -222,18 +220,9 @@ def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> N
 
 
 def _write_folder(frames: Iterator[NDArray[np.uint8]], path: Path) -> None:
-    path = Path(os.path.abspath(path))
-    if os.path.lexists(path) and not (path.is_dir() and all(_is_frame(file.name) for file in path.iterdir())):
-        raise ValueError(f"path must be a new folder or one of earlier frames, got {path}, which holds other things")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        unfinished, replaced = Path(folder) / "unfinished", Path(folder) / "replaced"
-        unfinished.mkdir()
+    with replaced_folder(path, _is_frame) as folder:
         for index, frame in enumerate(frames):
-            Image.fromarray(frame).save(unfinished / f"frame_{index:05d}.png")
-        if path.is_dir():
-            path.rename(replaced)
-        unfinished.rename(path)
+            Image.fromarray(frame).save(folder / f"frame_{index:05d}.png")
 
 
 def _is_frame(name: str) -> bool:

@@ -1,0 +1,52 @@
+"""A run's surface as meshes, in the data set's units: python scripts/mesh.py run=runs/mutant num_frames=100
+
+Writes one animated glTF (mesh.glb), or a PLY or OBJ file for each frame.
+"""
+
+import time
+from functools import partial
+from pathlib import Path
+
+import torch
+from hydra_app import load_config, load_renderer, load_scene, resolve_device, run_app
+from omegaconf import DictConfig
+
+from dnerf.core.checks import check_choice
+from dnerf.fields import TimeDependence
+from dnerf.meshing import FORMATS, Animation, extract_surface, meshes_through_time, write_gltf, write_meshes
+
+
+def main(config: DictConfig) -> None:
+    """Load the run, find its surface, move it through time and write it."""
+    formats = [config.format] if isinstance(config.format, str) else list(config.format)
+    for format in formats:
+        check_choice("format", format, ("glb", *FORMATS))
+    if config.time is not None and not 0 <= config.time <= 1:
+        raise ValueError(f"time must be in [0, 1], got {config.time}")
+    saved, scene = load_config(config.run), load_scene(config.run)
+    renderer = load_renderer(config.run, saved, resolve_device(config.device))
+    begun = time.perf_counter()
+    start = sum(scene.times) / 2 if config.time is None else config.time
+    names = ("resolution", "level", "min_share", "close_gaps")
+    extract = partial(extract_surface, box=scene.world.box, **{name: config[name] for name in names})
+    times = torch.linspace(*scene.times, config.num_frames)
+    meshes = meshes_through_time(renderer.field, times, extract, start=start)
+    if isinstance(meshes, Animation):
+        print(meshes.summary())
+        canonical = getattr(renderer.field, "canonical", None)
+        if isinstance(canonical, TimeDependence) and not canonical.is_static:
+            print(f"the canonical field changes with time: shape and colours are those of time {start:.3g}")
+    folder, similarity = Path(config.output or Path(config.run) / "meshes"), scene.world.similarity
+    for format in sorted(formats):  # glb first: it may be refused
+        if format == "glb":
+            settings = {"fps": config.fps, "every": config.key_every, "interpolation": config.interpolation}
+            path = write_gltf(meshes, folder / "mesh.glb", similarity=similarity, **settings)
+        else:
+            frames = map(meshes.frame, range(len(meshes.times)))
+            path = write_meshes(frames, folder / format, format, similarity=similarity)
+        print(f"{format}: {path}")
+    print(f"{time.perf_counter() - begun:.1f} s")
+
+
+if __name__ == "__main__":
+    run_app(main, "mesh")
