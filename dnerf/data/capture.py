@@ -5,12 +5,14 @@ splitting and reading pixels come afterwards and are the same for every format.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics
+
+SPLITS = ("train", "val", "test")
 
 
 @dataclass(frozen=True)
@@ -44,4 +46,4 @@ class Capture:
     background: tuple[float, float, float] | None = None  # behind opaque images, where the file states it
     points: Tensor | None = None  # (N, 3) float32 sparse points on surfaces
     up: tuple[float, float, float] | None = None  # where the format fixes it
-    notes: tuple[str, ...] = field(default=())  # repairs made and keys not known, a line each
+    notes: tuple[str, ...] = ()  # repairs made and keys not known, a line each

@@ -12,12 +12,12 @@ from dnerf.core.backgrounds import parse_color
 from dnerf.core.cameras import Intrinsics
 from dnerf.core.checks import as_box, check_choice, check_whole
 from dnerf.data.bounds import fit_box
+from dnerf.data.capture import SPLITS
 from dnerf.data.frames import Frames
 from dnerf.data.scene_record import Box, CameraSet, SceneRecord, World
 from dnerf.data.synthetic import DNERF_ANGLE_X, random_views, render_frames
 from dnerf.scenes import AnalyticScene
 
-SPLITS = ("train", "val", "test")
 DIGITS = 4  # of the longest side, to which a fitted box is rounded, outwards
 
 

@@ -5,10 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from dnerf.core.checks import check_choice
-from dnerf.data.capture import Capture
+from dnerf.data.capture import Capture, CaptureFrame
 from dnerf.data.formats import blender, colmap, llff, nerfies, rig, transforms
 from dnerf.data.formats.axes import check_axes
+from dnerf.data.formats.poses import as_pose, from_opencv
 
 AXES = ("auto", "opengl", "opencv")
 MAX_SUBFOLDERS = 200
@@ -22,7 +25,7 @@ class Format:
     """How the files of one format are recognised and read."""
 
     recognises: Callable[[Path], bool]
-    read: Callable[..., Capture]
+    read: Callable[[Path], Capture]  # with a pose's axes as the files have them, where they may differ
     looks_for: str  # what must lie in the folder
     fixed_axes: bool  # whether the format says what a pose's axes are, so that nobody writes others
 
@@ -74,19 +77,23 @@ def _read(root: Path, format: str, axes: str) -> Capture:
         raise ValueError(_not_recognised(root))
     name = found[0] if format == "auto" else format
     reader = FORMATS[name]
-    if reader.fixed_axes:
-        if axes == "opencv":
-            raise ValueError(f"axes must be auto or opengl: the format {name} says what a pose's axes are, got opencv")
-        capture = reader.read(root)
-    else:
-        capture = reader.read(root, opencv=axes == "opencv")
-        if axes == "auto":
-            check_axes(capture)
+    if reader.fixed_axes and axes == "opencv":
+        raise ValueError(f"axes must be auto or opengl: the format {name} says what a pose's axes are, got opencv")
+    capture = reader.read(root)
+    if axes == "opencv":
+        splits = {split: tuple(map(_from_opencv, frames)) for split, frames in capture.splits.items()}
+        capture = replace(capture, splits=splits)
+    elif axes == "auto" and not reader.fixed_axes:
+        check_axes(capture)
     others = [other for other in found if other != name]
     if others and format == "auto":
         note = f"{root}: read as {name}; it could be read with data.format={' or '.join(others)}, too"
         capture = replace(capture, notes=(note, *capture.notes))
     return capture
+
+
+def _from_opencv(frame: CaptureFrame) -> CaptureFrame:
+    return replace(frame, pose=as_pose(from_opencv(np.array(frame.pose))))
 
 
 def _not_recognised(root: Path) -> str:

@@ -6,12 +6,10 @@ BlenderNeRF and instant-ngp write it, too.
 
 from pathlib import Path
 
-from dnerf.data.capture import Capture, CaptureFrame
+from dnerf.data.capture import SPLITS, Capture, CaptureFrame
 from dnerf.data.formats.folder import Folder
 from dnerf.data.formats.json_files import Notes
 from dnerf.data.formats.manifest import Manifest, merged, named_points
-
-SPLITS = ("train", "val", "test")
 
 
 def recognises(root: Path) -> bool:
@@ -19,11 +17,8 @@ def recognises(root: Path) -> bool:
     return (root / "transforms_train.json").exists()
 
 
-def read(root: Path, *, opencv: bool = False) -> Capture:
+def read(root: Path) -> Capture:
     """What the files of all splits say; images of validation and test may be missing.
-
-    Args:
-        opencv: whether the files' matrices have the axes x right, y down, z forward.
 
     Raises:
         ValueError: in one line that names file and field, for anything missing, malformed or out of range.
@@ -31,24 +26,23 @@ def read(root: Path, *, opencv: bool = False) -> Capture:
     notes = Notes()
     folder = Folder(root, notes)
     manifests = {
-        split: Manifest(folder, root / f"transforms_{split}.json", opencv=opencv)
+        split: Manifest(folder, root / f"transforms_{split}.json")
         for split in SPLITS
         if split == "train" or (root / f"transforms_{split}.json").exists()
     }
-    splits: dict[str, tuple[CaptureFrame, ...]] = {}
+    splits = {"train": manifests["train"].frames()}
+    first = splits["train"][0].intrinsics
     for split, manifest in manifests.items():
-        first = splits["train"][0].intrinsics if splits else None
-        size = None if first is None else (first.width, first.height)
-        splits[split] = manifest.frames(cameras_only=split != "train", size=size)
+        if split != "train":
+            splits[split] = manifest.frames(cameras_only=True, size=(first.width, first.height))
     check_clocks(root, splits)
     planes = [found for manifest in manifests.values() if (found := manifest.planes()) is not None]
-    said = {manifest.path.name: manifest for manifest in manifests.values()}
     return Capture(
         root, "blender", splits,
         planes=(min(near for near, _ in planes), max(far for _, far in planes)) if planes else None,
-        background=merged({name: manifest.background() for name, manifest in said.items()}, root, "background"),
+        background=merged({m.path.name: m.background() for m in manifests.values()}, root, "background"),
         points=named_points(manifests["train"]),
-        up=merged({name: manifest.up() for name, manifest in said.items()}, root, "up"),
+        up=merged({m.path.name: m.up() for m in manifests.values()}, root, "up"),
         notes=notes.lines(),
     )  # fmt: skip
 

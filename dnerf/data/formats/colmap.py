@@ -11,9 +11,8 @@ from dnerf.data.capture import Capture, CaptureFrame, ImageFile
 from dnerf.data.formats.colmap_model import CameraModel, RegisteredImage, read_cameras, read_images, read_points
 from dnerf.data.formats.folder import Folder
 from dnerf.data.formats.json_files import MAX_NUMBER, Notes, short
-from dnerf.data.formats.manifest import unique
+from dnerf.data.formats.manifest import uniquely_named
 from dnerf.data.formats.manifest_cameras import MAX_FOCAL_RATIO, MAX_SIDE
-from dnerf.data.formats.names import frame_numbers
 from dnerf.data.formats.points import as_points
 from dnerf.data.formats.poses import Pose, from_opencv, rigid_pose
 
@@ -56,9 +55,9 @@ def read(root: Path) -> Capture:
     names = [_relative(image.name, str(model)) for image in images]
     place = _image_folder(folder, names)
     stems = [name.rpartition(".")[0] or name for name in names]
-    times = _times(stems, notes, root)
+    times = folder.times(stems)
     frames = []
-    for image, name, label, time in zip(images, names, unique(stems), times):
+    for image, name, stem, time in zip(images, names, stems, times):
         where = f"{model}: image {short(image.name)}"
         if image.camera not in cameras:
             raise ValueError(f"{where}: camera {image.camera} is not in the model")
@@ -66,21 +65,14 @@ def read(root: Path) -> Capture:
         mask = root / "masks" / f"{name}.png"
         frames.append(
             CaptureFrame(
-                label, _pose(image, where), cameras[image.camera], ImageFile(path),
+                stem, _pose(image, where), cameras[image.camera], ImageFile(path),
                 folder.inside(mask, where) if mask.is_file() else None, time,
             )
         )  # fmt: skip
     return Capture(
-        model, "colmap", {"all": tuple(frames)}, points=as_points(read_points(model), str(model)), notes=notes.lines()
-    )
-
-
-def _times(names: Sequence[str], notes: Notes, root: Path) -> Sequence[float | None]:
-    times = frame_numbers(names)
-    if times is None:
-        return [None] * len(names)
-    notes.add(f"{root}: times are the numbers in images' names; data.times=static if nothing moves")
-    return times
+        model, "colmap", {"all": uniquely_named(frames)}, points=as_points(read_points(model), str(model)),
+        notes=notes.lines(),
+    )  # fmt: skip
 
 
 def _relative(name: str, where: str) -> str:

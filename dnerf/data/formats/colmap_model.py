@@ -3,6 +3,7 @@
 Source: https://colmap.github.io/format.html and `src/colmap/scene/reconstruction_io.cc`.
 """
 
+import io
 import math
 import struct
 from collections.abc import Iterator
@@ -51,11 +52,9 @@ class Bytes:
 
     def take(self, layout: str) -> tuple:
         """Values of a `struct` layout."""
-        size = struct.calcsize(layout)
-        if size > len(self.data) - self.place:
-            raise ValueError(f"{self.path}: file is truncated at byte {self.place}")
-        self.place += size
-        return struct.unpack_from(layout, self.data, self.place - size)
+        place = self.place
+        self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self.data, place)
 
     def count(self, most: int, least_bytes: int, what: str) -> int:
         """A number of entries, each of at least so many bytes; ValueError if the file cannot hold them."""
@@ -164,13 +163,8 @@ def read_points(folder: Path) -> np.ndarray:
 
 def _lines(path: Path, max_words: int = 2**20) -> Iterator[tuple[int, list[str]]]:
     """Numbers and words of a text file's lines, comments left out."""
-    data, place, number = read_bytes(path, MAX_BYTES), 0, 0
-    while place < len(data):
-        end = data.find(b"\n", place)
-        end = len(data) if end < 0 else end
-        number += 1
-        words = data[place:end].decode("utf-8", "replace").split(maxsplit=max_words)
-        place = end + 1
+    for number, line in enumerate(io.BytesIO(read_bytes(path, MAX_BYTES)), start=1):
+        words = line.decode("utf-8", "replace").split(maxsplit=max_words)
         if not (words and words[0].startswith("#")):
             yield number, words
 

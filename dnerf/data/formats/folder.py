@@ -1,10 +1,12 @@
 """Files that a data set names, found inside its folder and nowhere else."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from dnerf.data.formats.json_files import Notes, short, text
+from dnerf.data.formats.names import frame_numbers
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 OTHER_SUFFIXES = (".webp", ".gif", ".tif", ".tiff", ".bmp", ".exr", ".heic", ".avif")  # of images not read
@@ -83,6 +85,14 @@ class Folder:
         relative = path.relative_to(self.root).as_posix()
         return relative.removesuffix(path.suffix) if path.suffix in IMAGE_SUFFIXES else relative
 
+    def times(self, names: Sequence[str]) -> Sequence[float | None]:
+        """The numbers in images' names, with a note; None for all where those tell nothing."""
+        times = frame_numbers(names)
+        if times is None:
+            return [None] * len(names)
+        self.notes.add(f"{self.root}: times are the numbers in images' names; data.times=static if nothing moves")
+        return times
+
     def _parts(self, value: str) -> tuple[list[str], bool]:
         """The parts of a path's text, and whether it does not start at the folder."""
         drive = PureWindowsPath(value).drive
@@ -91,16 +101,14 @@ class Folder:
             value = value.replace("\\", "/")
         outside = value.startswith("/") or bool(drive)
         parts = [part for part in value[len(drive) :].split("/") if part not in ("", ".")][:MAX_PARTS]
-        depth = 0
-        for part in parts:
-            depth += -1 if part == ".." else 1
-            outside |= depth < 0
         kept: list[str] = []
         for part in parts:
             if part != "..":
                 kept.append(part)
             elif kept:
                 kept.pop()
+            else:
+                outside = True
         return kept, outside
 
     def _existing(self, name: str, where: str) -> Path | None:

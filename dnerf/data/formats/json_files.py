@@ -59,11 +59,11 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
         raise ValueError(f"{path}: file cannot be read: {error.strerror or error}") from error
 
 
-def read_json(path: Path) -> Any:
-    """The value that a JSON file holds; ValueError in one line that names file and place."""
+def read_object(path: Path) -> dict[str, Any]:
+    """The object that a JSON file holds; ValueError in one line that names file and place."""
     data = read_bytes(path)
     try:
-        return json.loads(data.decode("utf-8-sig"))
+        value = json.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         said = what_else(data, "save it as UTF-8")
         raise ValueError(f"{path}: not UTF-8 at byte {error.start}; {said}") from None
@@ -75,6 +75,9 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path}: malformed JSON: nested too deeply") from None
     except ValueError as error:  # an integer of thousands of digits
         raise ValueError(f"{path}: malformed JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: must hold an object, got {short(value)}")
+    return value
 
 
 def _remedy(text: str, place: int) -> str:
@@ -86,14 +89,6 @@ def _remedy(text: str, place: int) -> str:
     if found.lstrip(", \n\r\t").startswith(("]", "}")) and "," in text[:place].rstrip()[-1:] + found[:1]:
         return "remove the comma before the bracket"
     return "correct it there, or export it again"
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """The object that a JSON file holds."""
-    value = read_json(path)
-    if not isinstance(value, dict):
-        raise ValueError(f"{path}: must hold an object, got {short(value)}")
-    return value
 
 
 def required(fields: Mapping[str, Any], key: str, where: str) -> Any:

@@ -4,7 +4,6 @@ A row holds a 3 x 5 matrix (axes down, right, back; position; height, width, foc
 or folders it is that of Neural 3D Video (Li et al. 2022), one row for each camera.
 """
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from dnerf.core.cameras import Intrinsics
 from dnerf.data.capture import Capture, CaptureFrame, ImageFile
 from dnerf.data.formats.folder import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Folder
 from dnerf.data.formats.json_files import MAX_FRAMES, MAX_NUMBER, Notes, number, whole
-from dnerf.data.formats.manifest import unique
+from dnerf.data.formats.manifest import uniquely_named
 from dnerf.data.formats.manifest_cameras import MAX_FOCAL_RATIO, MAX_SIDE
 from dnerf.data.formats.names import frame_numbers
 from dnerf.data.formats.points import read_npy
@@ -60,13 +59,14 @@ def read(root: Path) -> Capture:
         height, width = (whole(float(values[i, 4]), f"{where}: size", 1, MAX_SIDE) for i in (0, 1))
         focal = number(float(values[2, 4]), f"{where}: focal length", width / MAX_FOCAL_RATIO, width * MAX_FOCAL_RATIO)
         camera = Intrinsics(width, height, focal, focal)
-        frames += [CaptureFrame("", pose, camera, image, None, time) for image, time in of_camera]
+        frames += [CaptureFrame(_name(folder, image), pose, camera, image, None, time) for image, time in of_camera]
     near, far = float(rows[:, 15].min()), float(rows[:, 16].max())
     if not 0 <= near < far:
         notes.add(f"{path.name}: its near and far are not used, they are {near:g} and {far:g}")
-    names = unique([_name(folder, frame.image) for frame in frames if frame.image is not None])
-    named = tuple(CaptureFrame(name, f.pose, f.intrinsics, f.image, f.mask, f.time) for name, f in zip(names, frames))
-    return Capture(path, "llff", {"all": named}, planes=(near, far) if 0 <= near < far else None, notes=notes.lines())
+    return Capture(
+        path, "llff", {"all": uniquely_named(frames)}, planes=(near, far) if 0 <= near < far else None,
+        notes=notes.lines(),
+    )  # fmt: skip
 
 
 def _name(folder: Folder, image: ImageFile) -> str:
@@ -79,7 +79,8 @@ def _images(folder: Folder, num_cameras: int) -> list[Images]:
     for name in IMAGE_FOLDERS:
         paths = folder.listed(folder.root / name, IMAGE_SUFFIXES)
         if len(paths) == num_cameras:
-            return [[pair] for pair in _numbered(folder, paths, by_order=False)]
+            times = folder.times([path.stem for path in paths])
+            return [[(ImageFile(path), time)] for path, time in zip(paths, times)]
         seen += [f"{len(paths)} images in {name}/"] * bool(paths)
     videos = folder.listed(folder.root, VIDEO_SUFFIXES)
     if len(videos) == num_cameras:
@@ -87,7 +88,7 @@ def _images(folder: Folder, num_cameras: int) -> list[Images]:
     folders = [p for p in sorted(folder.root.iterdir()) if p.is_dir() and p.name not in IMAGE_FOLDERS]
     by_camera = [found for p in folders if (found := _of_camera(folder, p))]
     if len(by_camera) == num_cameras:
-        return [_numbered(folder, paths, by_order=True) for paths in by_camera]
+        return [_numbered(paths) for paths in by_camera]
     seen += [f"{len(videos)} videos"] * bool(videos) + [f"{len(by_camera)} folders of images"] * bool(by_camera)
     raise ValueError(
         f"{folder.root}: poses_bounds.npy has {num_cameras} cameras, so there must be as many images in images/, or "
@@ -104,18 +105,14 @@ def _of_camera(folder: Folder, path: Path) -> list[Path]:
     return []
 
 
-def _numbered(folder: Folder, paths: Sequence[Path], *, by_order: bool) -> Images:
-    """Images with the numbers in their names, or where those tell nothing by their order, if asked, or without."""
-    times: Sequence[float | None] | None = frame_numbers([path.stem for path in paths])
-    if times is None:
-        times = [float(i) for i in range(len(paths))] if by_order else [None] * len(paths)
-    elif not by_order:
-        folder.notes.add(f"{folder.root}: times are the numbers in images' names; data.times=static if nothing moves")
-    return [(ImageFile(path), time) for path, time in zip(paths, times)]
+def _numbered(paths: Sequence[Path]) -> Images:
+    """Images with the numbers in their names, or where those tell nothing by their order."""
+    times = frame_numbers([path.stem for path in paths]) or range(len(paths))
+    return [(ImageFile(path), float(time)) for path, time in zip(paths, times)]
 
 
 def _num_frames(path: Path) -> int:
     found = read_video_header(path).num_frames
-    if not 0 < found <= MAX_FRAMES or not math.isfinite(found):
+    if found > MAX_FRAMES:
         raise ValueError(f"{path}: video must have 1 to {MAX_FRAMES} frames, got {found}; cut it, or export fewer")
     return found

@@ -1,6 +1,7 @@
 """`transforms*.json`: what its frames say, in every dialect that NeRF's tools write."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,21 @@ from torch import Tensor
 from dnerf.core.cameras import Intrinsics
 from dnerf.data.capture import CaptureFrame, ImageFile
 from dnerf.data.formats.folder import Folder
-from dnerf.data.formats.json_files import MAX_FRAMES, matrix, number, numbers, read_object, required, short, text
+from dnerf.data.formats.json_files import (
+    MAX_FRAMES,
+    MAX_NUMBER,
+    matrix,
+    number,
+    numbers,
+    read_object,
+    required,
+    short,
+    text,
+)
 from dnerf.data.formats.keys import TIME_KEYS, check_keys
 from dnerf.data.formats.manifest_cameras import LensFields
 from dnerf.data.formats.points import read_ply
-from dnerf.data.formats.poses import from_opencv, rigid_pose
+from dnerf.data.formats.poses import Pose, rigid_pose
 from dnerf.data.images import read_header
 
 MAX_TIME = 1e20  # nanoseconds since 1970 are 2e18
@@ -27,14 +38,13 @@ class Manifest:
     Args:
         folder: where images lie, and where notes go.
         path: the file.
-        opencv: whether its matrices have the axes x right, y down, z forward.
 
     Raises:
         ValueError: in one line that names file and field, for anything missing, malformed or out of range.
     """
 
-    def __init__(self, folder: Folder, path: Path, *, opencv: bool = False) -> None:
-        self.folder, self.path, self.opencv = folder, path, opencv
+    def __init__(self, folder: Folder, path: Path) -> None:
+        self.folder, self.path = folder, path
         self.fields = read_object(path)
         listed = self.fields.pop("frames", None)
         if not isinstance(listed, list) or not listed:
@@ -70,7 +80,6 @@ class Manifest:
         times = self._times()
         sizes = [read_header(found[0])[:2] if found and there[index] else None for index, found in enumerate(images)]
         size = next((s for s in sizes if s is not None), size)
-        names = unique([self._name(index, found) for index, found in enumerate(images)])
         intrinsics: dict[Intrinsics, Intrinsics] = {}  # equal ones are kept once
         frames = []
         for index, (found, fields) in enumerate(zip(images, self.listed)):
@@ -80,26 +89,16 @@ class Manifest:
                 raise ValueError(f"{self.path}: w and h must be given, or an image be there, to know the images' size")
             camera = lens.intrinsics(*own_size)
             image = ImageFile(found[0]) if found and any(there) else None
-            frames.append(
-                CaptureFrame(
-                    names[index], self._pose(index), intrinsics.setdefault(camera, camera), image,
-                    self._mask(index), times[index],
-                )
-            )  # fmt: skip
-        return tuple(frames)
+            name = self.folder.name(found[0]) if found else f"frame_{index:05d}"
+            camera = intrinsics.setdefault(camera, camera)
+            frames.append(CaptureFrame(name, self._pose(index), camera, image, self._mask(index), times[index]))
+        return uniquely_named(frames)
 
     def planes(self) -> tuple[float, float] | None:
         """z-depths near and far, if the file states both."""
-        near, far = (self._number(key, 0) for key in ("near", "far"))
-        if near is None or far is None:
-            if near is not far:
-                self.folder.notes.add(f"{self.path.name}: near and far are used together only, one is not given")
-            return None
-        if not near < far:
-            raise ValueError(
-                f"{self.path}: near must be less than far, got {near:g} and {far:g}; correct or remove them"
-            )
-        return near, far
+        if (self.fields.get("near") is None) != (self.fields.get("far") is None):
+            self.folder.notes.add(f"{self.path.name}: near and far are used together only, one is not given")
+        return stated_planes(self.fields, self.path)
 
     def background(self) -> tuple[float, float, float] | None:
         """What opaque images show behind the scene, if the file says."""
@@ -112,18 +111,11 @@ class Manifest:
     def _where(self, index: int) -> str:
         return f"{self.path}: frames[{index}]"
 
-    def _number(self, key: str, low: float) -> float | None:
-        value = self.fields.get(key)
-        return None if value is None else number(value, f"{self.path}: {key}", low)
-
     def _image(self, index: int, cameras_only: bool) -> tuple[Path, bool] | None:
         frame, where = self.listed[index], self._where(index)
         if cameras_only and frame.get("file_path") is None:
             return None
         return self.folder.image(required(frame, "file_path", where), f"{where}.file_path")
-
-    def _name(self, index: int, found: tuple[Path, bool] | None) -> str:
-        return f"frame_{index:05d}" if found is None else self.folder.name(found[0])
 
     def _mask(self, index: int) -> Path | None:
         value, where = self.listed[index].get("mask_path"), f"{self._where(index)}.mask_path"
@@ -134,11 +126,9 @@ class Manifest:
             raise ValueError(f"{where}: no mask {path}; put it there, or remove mask_path from the frames")
         return path
 
-    def _pose(self, index: int) -> tuple[tuple[float, ...], ...]:
+    def _pose(self, index: int) -> Pose:
         where = f"{self._where(index)}.transform_matrix"
         values = matrix(required(self.listed[index], "transform_matrix", self._where(index)), where, ((4, 4), (3, 4)))
-        if self.opencv:
-            values = from_opencv(values)
         return rigid_pose(values, where, self.path.name, self.folder.notes)
 
     def _times(self) -> Sequence[float | None]:
@@ -154,6 +144,19 @@ class Manifest:
                 )
             return [number(v, f"{self._where(i)}.{key}", -MAX_TIME, MAX_TIME) for i, v in enumerate(values)]
         return [None] * len(self.listed)
+
+
+def stated_planes(fields: Mapping[str, Any], path: Path, scale: float = 1.0) -> tuple[float, float] | None:
+    """z-depths near and far of a file's fields, divided by a scale; None unless both are there."""
+    stated = [
+        number(fields[key], f"{path}: {key}", 0) / scale for key in ("near", "far") if fields.get(key) is not None
+    ]
+    if len(stated) < 2:
+        return None
+    near, far = stated
+    if not near < far <= MAX_NUMBER:
+        raise ValueError(f"{path}: near must be less than far, got {near:g} and {far:g}; correct or remove them")
+    return near, far
 
 
 def color(value: Any, where: str) -> tuple[float, float, float] | None:
@@ -176,17 +179,17 @@ def direction(value: Any, where: str) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def unique(names: Sequence[str]) -> list[str]:
-    """Names that occur again get a number."""
+def uniquely_named(frames: Sequence[CaptureFrame]) -> tuple[CaptureFrame, ...]:
+    """The same frames; names that occur again get a number."""
     counts: dict[str, int] = {}
-    result: dict[str, None] = {}
-    for name in names:
-        other = name
-        while other in result:
-            counts[name] = counts.get(name, 1) + 1
-            other = f"{name}#{counts[name]}"
-        result[other] = None
-    return list(result)
+    result: dict[str, CaptureFrame] = {}
+    for frame in frames:
+        name = frame.name
+        while name in result:
+            counts[frame.name] = counts.get(frame.name, 1) + 1
+            name = f"{frame.name}#{counts[frame.name]}"
+        result[name] = replace(frame, name=name)
+    return tuple(result.values())
 
 
 def merged(values: Mapping[str, Any], path: Path, key: str) -> Any:

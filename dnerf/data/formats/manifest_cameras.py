@@ -162,18 +162,13 @@ def _focal_lengths(
     for key in MATRIX_KEYS:
         if fields.get(key) is not None:
             return _of_matrix(fields[key], f"{place}{key}", width, height)
-    focal_y = None if fields.get("fl_y") is None else _in_pixels(fields["fl_y"], f"{place}fl_y", height)
-    if focal_y is None and fields.get("camera_angle_y") is not None:
-        focal_y = _of_angle(fields["camera_angle_y"], f"{place}camera_angle_y", height)
-    if fields.get("fl_x") is not None:
-        focal_x = _in_pixels(fields["fl_x"], f"{place}fl_x", width)
-    elif fields.get("camera_angle_x") is not None:
-        focal_x = _of_angle(fields["camera_angle_x"], f"{place}camera_angle_x", width)
-    elif focal_y is not None:
-        focal_x = focal_y
-    else:
-        return None
-    return focal_x, focal_x if focal_y is None else focal_y, None, None
+    found = []
+    for axis, size in (("y", height), ("x", width)):
+        for key, focal_length in ((f"fl_{axis}", _in_pixels), (f"camera_angle_{axis}", _of_angle)):
+            if fields.get(key) is not None:
+                found.append(focal_length(fields[key], f"{place}{key}", size))
+                break
+    return (found[-1], found[0], None, None) if found else None  # one may stand for both
 
 
 def _in_pixels(value: Any, place: str, size: int) -> float:

@@ -28,7 +28,7 @@ from dnerf.data.formats.json_files import (
     short,
     whole,
 )
-from dnerf.data.formats.manifest import direction
+from dnerf.data.formats.manifest import direction, stated_planes
 from dnerf.data.formats.manifest_cameras import MAX_COEFFICIENT, MAX_FOCAL_RATIO, MAX_SIDE, MAX_SKEW
 from dnerf.data.formats.names import frame_numbers
 from dnerf.data.formats.points import as_points, read_npy
@@ -99,7 +99,7 @@ def _names(value: Any, where: str) -> list[str]:
 def _images(folder: Folder, ids: Sequence[str]) -> tuple[Path, str]:
     """The folder of the largest images, and their suffix."""
     scales = []
-    for path in (folder.root / "rgb").glob("*x") if (folder.root / "rgb").is_dir() else ():
+    for path in (folder.root / "rgb").glob("*x"):
         if re.fullmatch(r"[0-9]{1,4}x", path.name) and path.is_dir():
             scales.append((int(path.name[:-1]), path))
     for _, path in sorted(scales):
@@ -143,8 +143,8 @@ def _camera(path: Path, notes: Notes) -> tuple[Pose, Intrinsics]:
     """Pose and intrinsics of one camera file; its orientation is world to camera, with OpenCV's axes."""
     fields = read_object(path)
 
-    def found(key: str, default: Any = None) -> Any:
-        return fields[key] if fields.get(key) is not None or default is None else default
+    def found(key: str, default: Any) -> Any:
+        return default if fields.get(key) is None else fields[key]
 
     for key in ("orientation", "position", "focal_length", "principal_point", "image_size"):
         required(fields, key, str(path))
@@ -181,13 +181,8 @@ def _planes(path: Path) -> tuple[float, float] | None:
     if not path.exists():
         return None
     fields = read_object(path)
-    if fields.get("near") is None or fields.get("far") is None:
-        return None
     scale = number(fields.get("scale", 1.0), f"{path}: scale", 1 / MAX_NUMBER, MAX_NUMBER)
-    near, far = (number(fields[key], f"{path}: {key}", 0) / scale for key in ("near", "far"))
-    if not near < far <= MAX_NUMBER:
-        raise ValueError(f"{path}: near must be less than far, got {near:g} and {far:g}; correct or remove them")
-    return near, far
+    return stated_planes(fields, path, scale)
 
 
 def _points(path: Path) -> Tensor | None:

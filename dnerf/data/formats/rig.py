@@ -1,6 +1,5 @@
 """Fixed cameras with a video each and `info.json`: ScalarFlow's smoke (Eckert et al. 2019) as HyFluid packs it."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ from dnerf.data.formats.json_files import (
     whole,
 )
 from dnerf.data.formats.keys import LENS_KEYS
-from dnerf.data.formats.manifest import color, unique
+from dnerf.data.formats.manifest import color, stated_planes, uniquely_named
 from dnerf.data.formats.manifest_cameras import MAX_SIDE, LensFields
-from dnerf.data.formats.poses import from_opencv, rigid_pose
+from dnerf.data.formats.poses import rigid_pose
 from dnerf.data.videos import read_video_header
 
 SPLITS = {"train": "train_videos", "test": "test_videos"}
@@ -40,11 +39,8 @@ def recognises(root: Path) -> bool:
         return False
 
 
-def read(root: Path, *, opencv: bool = False) -> Capture:
+def read(root: Path) -> Capture:
     """What the file says; each video's frames, with times in seconds.
-
-    Args:
-        opencv: whether the file's matrices have the axes x right, y down, z forward.
 
     Raises:
         ValueError: in one line that names file and field, for anything missing, malformed or out of range.
@@ -62,24 +58,21 @@ def read(root: Path, *, opencv: bool = False) -> Capture:
         for index, video in enumerate(videos or ()):
             if not isinstance(video, dict):
                 raise ValueError(f"{path}: {key}[{index}] must be an object, got {short(video)}")
-            frames += _frames(folder, video, fields, f"{path}: {key}[{index}]", opencv, left - len(frames))
+            frames += _frames(folder, video, fields, f"{path}: {key}[{index}]", left - len(frames))
         left -= len(frames)
         if frames:
-            names = unique([frame.name for frame in frames])
-            splits[split] = tuple(replace(frame, name=name) for name, frame in zip(names, frames))
+            splits[split] = uniquely_named(frames)
     if "train" not in splits:
         raise ValueError(f"{path}: train_videos must name at least one video, got none")
     _note_unknown(fields, notes)
     return Capture(
-        path, "rig", splits, planes=_planes(path, fields),
+        path, "rig", splits, planes=stated_planes(fields, path),
         background=color(fields.get("frame_bkg_color"), f"{path}: frame_bkg_color"),
         up=UP.get(fields["rot"]) if isinstance(fields.get("rot"), str) else None, notes=notes.lines(),
     )  # fmt: skip
 
 
-def _frames(
-    folder: Folder, video: dict[str, Any], shared: dict[str, Any], where: str, opencv: bool, most: int
-) -> list[CaptureFrame]:
+def _frames(folder: Folder, video: dict[str, Any], shared: dict[str, Any], where: str, most: int) -> list[CaptureFrame]:
     """The frames of one video, at most so many."""
     _note_unknown(video, folder.notes)
     name = text(required(video, "file_name", where), f"{where}.file_name")
@@ -101,7 +94,6 @@ def _frames(
             f"{where}.frame_num: frames of all videos must be at most {MAX_FRAMES}, got more; cut the videos"
         )
     values = matrix(required(video, "transform_matrix", where), f"{where}.transform_matrix", ((4, 4), (3, 4)))
-    values = from_opencv(values) if opencv else values
     pose = rigid_pose(values, f"{where}.transform_matrix", "info.json", folder.notes)
     lens = LensFields(video, shared, where, str(folder.root / "info.json"))
     intrinsics = lens.intrinsics(*(lens.stated_size() or (width, height)))
@@ -110,15 +102,6 @@ def _frames(
         CaptureFrame(f"{stem}/{index:05d}", pose, intrinsics, ImageFile(path, index), None, index / rate)
         for index in range(count)
     ]
-
-
-def _planes(path: Path, fields: dict[str, Any]) -> tuple[float, float] | None:
-    if fields.get("near") is None or fields.get("far") is None:
-        return None
-    near, far = (number(fields[key], f"{path}: {key}", 0) for key in ("near", "far"))
-    if not near < far:
-        raise ValueError(f"{path}: near must be less than far, got {near:g} and {far:g}; correct or remove them")
-    return near, far
 
 
 def _note_unknown(fields: dict[str, Any], notes: Notes) -> None:

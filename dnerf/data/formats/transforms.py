@@ -2,12 +2,10 @@
 
 from pathlib import Path
 
-from dnerf.data.capture import Capture, CaptureFrame
+from dnerf.data.capture import SPLITS, Capture, CaptureFrame
 from dnerf.data.formats.folder import Folder
 from dnerf.data.formats.json_files import Notes, short
 from dnerf.data.formats.manifest import Manifest, named_points
-
-SPLITS = ("train", "val", "test")
 
 
 def recognises(root: Path) -> bool:
@@ -15,17 +13,14 @@ def recognises(root: Path) -> bool:
     return (root / "transforms.json").exists()
 
 
-def read(root: Path, *, opencv: bool = False) -> Capture:
+def read(root: Path) -> Capture:
     """What the file says; its frames are one split, unless it lists file names of several as nerfstudio does.
-
-    Args:
-        opencv: whether the file's matrices have the axes x right, y down, z forward.
 
     Raises:
         ValueError: in one line that names file and field, for anything missing, malformed or out of range.
     """
     notes = Notes()
-    manifest = Manifest(Folder(root, notes), root / "transforms.json", opencv=opencv)
+    manifest = Manifest(Folder(root, notes), root / "transforms.json")
     frames = manifest.frames()
     return Capture(
         manifest.path, "transforms", _by_split(manifest, frames, notes), planes=manifest.planes(),
