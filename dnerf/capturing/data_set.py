@@ -121,7 +121,7 @@ def _given_model(folder: Path, frames: Sequence[ChosenFrame]) -> Any:
         model = load_pycolmap().Reconstruction(folder)
     except (ValueError, RuntimeError, OSError) as error:
         raise ValueError(f"model: {folder} must hold cameras, images and points3D of COLMAP; {error}") from error
-    names = {Path(frame.name).with_suffix("").as_posix(): frame.name for frame in frames}
+    names = {frame.stem: frame.name for frame in frames}
     for image in model.images.values():
         name = names.get(Path(image.name).with_suffix("").as_posix())
         if name is None:
@@ -152,12 +152,8 @@ def _keep(models: Sequence[Any], num_frames: int, min_share: float, out_dir: Pat
 
 
 def _write_manifest(cameras: Sequence[CaptureFrame], frames: Sequence[ChosenFrame], out_dir: Path) -> None:
-    """Write `transforms.json`."""
-    times = {Path(frame.name).with_suffix("").as_posix(): (frame.name, frame.time) for frame in frames}
-    listed = []
-    for camera in cameras:
-        name, time = times[camera.name]
-        listed.append({"file_path": f"images/{name}", "time": time, "transform_matrix": camera.pose})
+    times = {frame.stem: frame.time for frame in frames}
+    listed = [{"file_path": f"images/{c.name}.png", "time": times[c.name], "transform_matrix": c.pose} for c in cameras]
     fields = transforms_fields(listed, [camera.intrinsics for camera in cameras], {"ply_file_path": POINTS})
     write_json(out_dir / MANIFEST, fields)
 

@@ -26,6 +26,11 @@ class ChosenFrame:
     film: int  # index of its camera
     size: tuple[int, int]  # width and height
 
+    @property
+    def stem(self) -> str:
+        """The name without its suffix, by which models and masks know the frame."""
+        return self.name.removesuffix(".png")
+
 
 @dataclass(frozen=True)
 class Film:
@@ -41,8 +46,7 @@ class Film:
         if not self.images:
             times = read_frame_times(self.path)
             return [time - times[0] for time in times]
-        names = [path.relative_to(self.path).with_suffix("").as_posix() for path in self.images]
-        return frame_numbers(names) or [float(index) for index in range(len(names))]
+        return frame_numbers(_stems(self.path, self.images)) or [float(index) for index in range(len(self.images))]
 
     def pixels(self) -> Iterator[Bytes]:
         """Each frame upright, (H, W, 3) uint8."""
@@ -90,12 +94,16 @@ def _is_seen(path: Path, suffixes: tuple[str, ...]) -> bool:
 
 def _film_of_images(folder: Path) -> Film:
     paths = sorted(path for path in folder.rglob("*") if _is_seen(path, IMAGE_SUFFIXES) and path.is_file())
-    names = [path.relative_to(folder).with_suffix("").as_posix() for path in paths]
+    names = _stems(folder, paths)
     if len(paths) < 2 or len(set(names)) < len(paths):
         raise ValueError(f"images: {folder} must hold PNG or JPEG images of different names, got {len(paths)}")
     numbers = frame_numbers(names)
     paths = paths if numbers is None else [path for _, path in sorted(zip(numbers, paths))]
     return Film("", folder, tuple(paths), is_ordered=numbers is not None)
+
+
+def _stems(folder: Path, paths: Sequence[Path]) -> list[str]:
+    return [path.relative_to(folder).with_suffix("").as_posix() for path in paths]
 
 
 def choose_frames(films: Sequence[Film], folder: Path, num_frames: int | None, width: int) -> list[ChosenFrame]:

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from dnerf.core.backgrounds import parse_color
 from dnerf.data.frames import Frames
+from dnerf.data.pixel_layout import evenly_spread
 
 MAX_FRAMES = 32  # whose borders are looked at, evenly spread
 SAME_LEVELS = 8  # of 255: what JPEG and shading leave of one colour
@@ -35,27 +36,20 @@ def background_contradiction(color: Tensor | None, frames: Frames) -> str | None
     """
     if color is None or frames.is_transparent:
         return None
+    behind = background_color(frames)
+    if behind is None or (color.detach().float().cpu() - behind).abs().max() <= SAME_LEVELS / 255:
+        return None
+    shown = _rounded(behind)
     if frames.background is not None:
-        stated = torch.tensor(parse_color(frames.background))
-        if not _differ(color, stated):
-            return None
-        shown = _rounded(stated)
         raise ValueError(
             f"background must be {shown} as the data set states, got {_rounded(color)}: the model would explain the "
             "difference by density in empty space; leave background=auto, or set background=white "
             f"background.color={str(shown).replace(' ', '')}"
         )
-    border = border_color(frames)
-    if border is None or not _differ(color, border):
-        return None
     return (
-        f"background is {_rounded(color)}, but most pixels at the images' borders are {_rounded(border)}: the model "
+        f"background is {_rounded(color)}, but most pixels at the images' borders are {shown}: the model "
         "would explain the difference by density in empty space; leave background=auto, or set background.color"
     )
-
-
-def _differ(color: Tensor, other: Tensor) -> bool:
-    return float((color.detach().float().cpu() - other).abs().max()) > SAME_LEVELS / 255
 
 
 def background_color(frames: Frames) -> Tensor | None:
@@ -65,9 +59,8 @@ def background_color(frames: Frames) -> Tensor | None:
 
 def border_color(frames: Frames) -> Tensor | None:
     """The colour (3,) in [0, 1] that most pixels at the borders of opaque images have; None if there is none."""
-    chosen = torch.linspace(0, len(frames) - 1, min(len(frames), MAX_FRAMES)).round().long()
     parts = []
-    for index in chosen.tolist():
+    for index in evenly_spread(len(frames), MAX_FRAMES):
         image = frames.stored_image(index)[..., :3]
         parts += [image[[0, -1]].flatten(0, 1).cpu(), image[:, [0, -1]].flatten(0, 1).cpu()]
     border = torch.cat(parts).float()

@@ -10,6 +10,7 @@ from dnerf.data.background_check import background_color
 from dnerf.data.carving import EVERY_PIXEL, Silhouettes, carve, hold_opaque, opaque_rays
 from dnerf.data.frames import Frames
 from dnerf.data.normalization import IDENTITY, Similarity
+from dnerf.data.pixel_layout import evenly_spread
 from dnerf.samplers import OccupiedCells
 
 ROOM = 0.03  # at each face, of the longest side: surfaces are softer in training than they are
@@ -86,7 +87,7 @@ def seen_box(frames: Frames, share: float) -> Tensor:
     """
     steps = torch.linspace(0, 1, 32, device=frames.poses.device)
     positions = []
-    for index in _evenly(len(frames), MAX_VIEWS):
+    for index in evenly_spread(len(frames), MAX_VIEWS):
         height, width = frames.layout.sizes[index]
         rows, columns = (torch.linspace(0, size - 1, 4, device=steps.device).round() for size in (height, width))
         rays = frames.camera(index).rays(0.0, (width * rows[:, None] + columns).reshape(-1).long())
@@ -102,7 +103,7 @@ def seen_box(frames: Frames, share: float) -> Tensor:
 
 def share_of_views(frames: Frames, positions: Tensor) -> Tensor:
     """The share (N,) of views between whose planes, and within whose image, positions (N, 3) in world units lie."""
-    chosen = _evenly(len(frames), LOOKED_AT)
+    chosen = evenly_spread(len(frames), LOOKED_AT)
     seen = torch.zeros(len(positions), device=positions.device)
     for index in chosen:
         height, width = frames.layout.sizes[index]
@@ -111,10 +112,6 @@ def share_of_views(frames: Frames, positions: Tensor) -> Tensor:
         is_between = (frames.near <= depth) & (depth <= frames.far)
         seen += is_between & (x > -1) & (x < width) & (y > -1) & (y < height)
     return seen / len(chosen)
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    return torch.linspace(0, count - 1, min(count, most)).round().long().tolist()
 
 
 def check_views(frames: Frames, box: Tensor, similarity: Similarity = IDENTITY) -> None:

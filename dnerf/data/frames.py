@@ -12,7 +12,7 @@ from dnerf.core.checks import check_shape
 from dnerf.core.frame_intrinsics import FrameIntrinsics
 from dnerf.core.rays import Rays
 from dnerf.data.pixel_layout import PixelLayout
-from dnerf.data.pixel_store import empty_pixels
+from dnerf.data.pixel_store import empty_images
 
 RIGID_TOLERANCE = 1e-3
 
@@ -199,13 +199,11 @@ class Frames:
         )  # fmt: skip
 
     def _images_of(self, rows: Sequence[int]) -> Tensor:
-        parts = [self.stored_image(i) for i in rows]
-        is_shared = len({part.shape for part in parts}) == 1
-        height, width, channels = parts[0].shape
-        num_pixels = sum(part.shape[0] * part.shape[1] for part in parts)
-        images = empty_pixels((num_pixels, channels), device=self.images.device)
-        torch.cat([part.flatten(0, 1) for part in parts], out=images)
-        return images.view(-1, height, width, channels) if is_shared else images
+        sizes = [self.layout.sizes[i] for i in rows]
+        images, parts = empty_images(sizes, self.images.shape[-1], device=self.images.device)
+        for i, part in zip(rows, parts):
+            part.copy_(self.stored_image(i))
+        return images
 
     def to(self, device: str | torch.device) -> "Frames":
         """The same frames on another device."""

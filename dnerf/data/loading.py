@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics
 from dnerf.core.checks import check_whole
-from dnerf.data.capture import CaptureFrame
+from dnerf.data.capture import CaptureFrame, ImageFile
 from dnerf.data.images import (
     MAX_PIXELS,
     Bytes,
@@ -22,7 +22,7 @@ from dnerf.data.images import (
     read_header,
     read_image,
 )
-from dnerf.data.pixel_store import MAX_MEMORY, empty_pixels
+from dnerf.data.pixel_store import MAX_MEMORY, empty_images
 from dnerf.data.videos import read_frames, video_size
 
 DEFAULT_WIDTH = 400  # in pixels, unless told: D-NeRF's protocol
@@ -55,12 +55,14 @@ class _Header:
     """How one frame's image is read."""
 
     frame: CaptureFrame  # with intrinsics at the final size
-    path: Path
-    number: int | None  # in a video, from 0; None for an image file
+    image: ImageFile
     size: tuple[int, int]  # width and height, decoded
     may_have_alpha: bool = False
     is_upright: bool = True  # turned as its EXIF data say
     stated: tuple[int, int] | None = None  # width and height of the file's intrinsics, if the image has others
+
+
+_Wanted = dict[int, list[tuple[_Header, Tensor]]]  # by frame of a video
 
 
 def load_frames(
@@ -96,16 +98,16 @@ def load_frames(
     if resolution is not None and resolution > widest:
         raise ValueError(
             f"resolution must be at most the images' width {widest}, or null for that, got {resolution}: "
-            f"{headers[0].path}"
+            f"{headers[0].image.path}"
         )
     notes += _scaled_notes(headers)
     if has_alpha is None:
         masked = any(header.frame.mask is not None for header in headers)
-        has_alpha = masked or any(is_transparent(header.path) for header in headers if header.may_have_alpha)
-    images, parts = _room([header.frame.intrinsics for header in headers], 4 if has_alpha else 3, max_memory)
-    tasks = [_task(headers, indices, parts) for indices in _by_file(headers)]
+        has_alpha = masked or any(is_transparent(header.image.path) for header in headers if header.may_have_alpha)
+    sizes = [(header.frame.intrinsics.height, header.frame.intrinsics.width) for header in headers]
+    images, parts = empty_images(sizes, 4 if has_alpha else 3, max_memory)
     largest = max(header.size[0] * header.size[1] for header in headers)
-    _in_threads(tasks, min(MAX_THREADS, max(1, MAX_PIXELS // largest)))
+    in_threads(_tasks(headers, parts), min(MAX_THREADS, max(1, MAX_PIXELS // largest)))
     return LoadedFrames(tuple(header.frame for header in headers), images, notes)
 
 
@@ -115,9 +117,9 @@ def check_frames(frames: Sequence[CaptureFrame], *, resolution: int | None = Non
     Of videos only the headers are read.
     """
     headers = [_header(frame, resolution) for frame in _present(frames)[0]]
-    paths = [header.path for header in headers if header.number is None]
+    paths = [header.image.path for header in headers if header.image.frame is None]
     paths += [header.frame.mask for header in headers if header.frame.mask is not None]
-    _in_threads([partial(check_image, path) for path in paths], MAX_THREADS)
+    in_threads([partial(check_image, path) for path in paths], MAX_THREADS)
 
 
 def final_intrinsics(frame: CaptureFrame, resolution: int | None = None) -> Intrinsics:
@@ -149,10 +151,10 @@ def _present(frames: Sequence[CaptureFrame]) -> tuple[list[CaptureFrame], tuple[
 
 def _header(frame: CaptureFrame, resolution: int | None) -> _Header:
     """An image's size, and its frame with the intrinsics at the size to which it is to be reduced."""
-    assert frame.image is not None
-    path, number, intrinsics = frame.image.path, frame.image.frame, frame.intrinsics
-    is_upright, may_have_alpha = True, False
-    if number is not None:
+    image, intrinsics, stated = frame.image, frame.intrinsics, None
+    assert image is not None
+    path, is_upright, may_have_alpha = image.path, True, False
+    if image.frame is not None:
         size = video_size(path)
     else:
         width, height, may_have_alpha = read_header(path)
@@ -161,20 +163,16 @@ def _header(frame: CaptureFrame, resolution: int | None) -> _Header:
         # Some programs work with images as they are stored; their intrinsics tell.
         if stored != size and stored == (intrinsics.width, intrinsics.height):
             size, is_upright = stored, False
-    stated = (intrinsics.width, intrinsics.height)
-    if stated == size:
-        return _Header(_with(frame, _reduced(intrinsics, resolution)), path, number, size, may_have_alpha, is_upright)
-    if not has_shape(stated, size):
-        raise ValueError(
-            f"{path}: image must have the shape of its intrinsics, {stated[0]} x {stated[1]}, got {size[0]} x "
-            f"{size[1]}: correct the file's width, height, focal lengths and principal point, or crop the image"
-        )
-    intrinsics = _reduced(intrinsics.resized(*size), resolution)
-    return _Header(_with(frame, intrinsics), path, number, size, may_have_alpha, is_upright, stated)
-
-
-def _with(frame: CaptureFrame, intrinsics: Intrinsics) -> CaptureFrame:
-    return frame if intrinsics == frame.intrinsics else replace(frame, intrinsics=intrinsics)
+    if (intrinsics.width, intrinsics.height) != size:
+        stated = (intrinsics.width, intrinsics.height)
+        if not has_shape(stated, size):
+            raise ValueError(
+                f"{path}: image must have the shape of its intrinsics, {stated[0]} x {stated[1]}, got {size[0]} x "
+                f"{size[1]}: correct the file's width, height, focal lengths and principal point, or crop the image"
+            )
+        intrinsics = intrinsics.resized(*size)
+    frame = replace(frame, intrinsics=_reduced(intrinsics, resolution))
+    return _Header(frame, image, size, may_have_alpha, is_upright, stated)
 
 
 def _reduced(intrinsics: Intrinsics, resolution: int | None) -> Intrinsics:
@@ -187,65 +185,43 @@ def _reduced(intrinsics: Intrinsics, resolution: int | None) -> Intrinsics:
 
 
 def _scaled_notes(headers: Sequence[_Header]) -> tuple[str, ...]:
-    scaled = [header for header in headers if header.stated is not None]
     notes = []
+    scaled = [(header, header.stated) for header in headers if header.stated is not None]
     if scaled:
-        first = scaled[0]
-        assert first.stated is not None
+        first, (width, height) = scaled[0]
         notes.append(
-            f"intrinsics of {first.stated[0]} x {first.stated[1]} are scaled to images of {first.size[0]} x "
-            f"{first.size[1]}, of {len(scaled)} frames: {first.path}"
+            f"intrinsics of {width} x {height} are scaled to images of {first.size[0]} x "
+            f"{first.size[1]}, of {len(scaled)} frames: {first.image.path}"
         )
     if turned := [header for header in headers if not header.is_upright]:
         notes.append(
             f"{len(turned)} images are taken as they are stored, for their intrinsics have that size, not upright as "
-            f"their EXIF data say: {turned[0].path}"
+            f"their EXIF data say: {turned[0].image.path}"
         )
     return tuple(notes)
 
 
-def _room(intrinsics: Sequence[Intrinsics], channels: int, max_memory: int) -> tuple[Tensor, list[Tensor]]:
-    """Pixels of all frames, as in `Frames.images`, and views (H, W, C) of each."""
-    sizes = [(lens.height, lens.width) for lens in intrinsics]
-    if len(set(sizes)) == 1:
-        images = empty_pixels((len(sizes), *sizes[0], channels), max_memory)
-        return images, list(images)
-    images = empty_pixels((sum(height * width for height, width in sizes), channels), max_memory)
-    parts = images.split([height * width for height, width in sizes])
-    return images, [part.view(*size, channels) for part, size in zip(parts, sizes)]
+def _tasks(headers: Sequence[_Header], parts: Sequence[Tensor]) -> list[Callable[[], None]]:
+    """What fills the parts with pixels: one task for each image, then one for each video."""
+    images: list[Callable[[], None]] = []
+    videos: dict[Path, _Wanted] = {}
+    for header, part in zip(headers, parts):
+        path, number = header.image.path, header.image.frame
+        if number is None:
+            images.append(partial(_fill, header, part, partial(read_image, path, upright=header.is_upright)))
+        else:
+            videos.setdefault(path, {}).setdefault(number, []).append((header, part))
+    return images + [partial(_fill_from_video, path, wanted) for path, wanted in videos.items()]
 
 
-def _by_file(headers: Sequence[_Header]) -> list[list[int]]:
-    """Frames of one video together, in one list; an image alone."""
-    videos: dict[Path, list[int]] = {}
-    for index, header in enumerate(headers):
-        if header.number is not None:
-            videos.setdefault(header.path, []).append(index)
-    return [[index] for index, header in enumerate(headers) if header.number is None] + list(videos.values())
-
-
-def _task(headers: Sequence[_Header], indices: Sequence[int], parts: Sequence[Tensor]) -> Callable[[], None]:
-    """What fills the parts with the pixels of one file."""
-
-    def image() -> None:
-        (index,) = indices
-        read = partial(read_image, headers[index].path, upright=headers[index].is_upright)
-        _fill(headers[index], parts[index], read)
-
-    def video() -> None:
-        path = headers[indices[0]].path
-        wanted: dict[int, list[int]] = {}
-        for index in indices:
-            wanted.setdefault(headers[index].number or 0, []).append(index)
-        number = -1
-        for number, pixels in enumerate(read_frames(path)):
-            for index in wanted.pop(number, ()):
-                _fill(headers[index], parts[index], partial(finish_image, pixels, path))
-            if not wanted:
-                return
-        raise ValueError(f"{path}: video must have the frame {min(wanted)}, counted from 0, got {number + 1} frames")
-
-    return image if headers[indices[0]].number is None else video
+def _fill_from_video(path: Path, wanted: _Wanted) -> None:
+    number = -1
+    for number, pixels in enumerate(read_frames(path)):
+        for header, part in wanted.pop(number, ()):
+            _fill(header, part, partial(finish_image, pixels, path))
+        if not wanted:
+            return
+    raise ValueError(f"{path}: video must have the frame {min(wanted)}, counted from 0, got {number + 1} frames")
 
 
 def _fill(header: _Header, part: Tensor, read: Callable[..., Bytes]) -> None:
@@ -254,7 +230,7 @@ def _fill(header: _Header, part: Tensor, read: Callable[..., Bytes]) -> None:
     part.copy_(torch.from_numpy(pixels))
 
 
-def _in_threads(tasks: Sequence[Callable[[], None]], num_threads: int) -> None:
+def in_threads(tasks: Sequence[Callable[[], None]], num_threads: int) -> None:
     """Do tasks in threads; the first failure in their order is raised, the rest cancelled."""
     with ThreadPoolExecutor(num_threads) as pool:
         futures = [pool.submit(task) for task in tasks]

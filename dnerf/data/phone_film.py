@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -57,16 +58,10 @@ def film_by_phone(scene: AnalyticScene, width: int, *, num_train: int, num_test:
     The held-out frames have no distortion, the exposure 1, and times in the middle between the film's.
     """
     times = torch.linspace(0, 1, num_train)
-    train = render_frames(
-        scene, phone_poses(times), times, phone_lens(width), background=SKY, gains=phone_gains(times), planes=PLANES,
-        oversampling=2,
-    )  # fmt: skip
+    render = partial(render_frames, scene, background=SKY, planes=PLANES, oversampling=2)
+    train = render(phone_poses(times), times, phone_lens(width), gains=phone_gains(times))
     times = (torch.arange(num_test) + 0.5) / num_test
     angles = (-0.5 * math.pi + 0.6 * torch.cos(2 * math.pi * times)).tolist()
     poses = [look_at((0.37 * math.cos(a), 0.37 * math.sin(a), 0.03), (0.0, 0.0, -0.07)) for a in angles]
     lens = replace(phone_lens(width), distortion=None)
-    test = render_frames(
-        scene, torch.stack(poses), times, lens, background=SKY, gains=torch.ones(num_test, 3), planes=PLANES,
-        oversampling=2,
-    )  # fmt: skip
-    return {"train": train, "test": test}
+    return {"train": train, "test": render(torch.stack(poses), times, lens, gains=torch.ones(num_test, 3))}

@@ -6,6 +6,11 @@ import torch
 from torch import Tensor
 
 
+def evenly_spread(count: int, most: int) -> list[int]:
+    """Indices below `count`, at most so many, evenly from the first to the last."""
+    return torch.linspace(0, count - 1, min(count, most)).round().long().tolist()
+
+
 class PixelLayout:
     """Numbers of pixels: frame after frame, each row by row.
 

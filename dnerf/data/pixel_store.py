@@ -11,6 +11,18 @@ from torch import Tensor
 MAX_MEMORY = 2 * 2**30  # bytes of one split's pixels that are held in memory
 
 
+def empty_images(
+    sizes: Sequence[tuple[int, int]], channels: int, max_memory: int = MAX_MEMORY, *, device: str | torch.device = "cpu"
+) -> tuple[Tensor, Sequence[Tensor]]:
+    """Room for images of sizes (height, width), as in `Frames.images`, and views (H, W, C) of each: `empty_pixels`."""
+    if len(set(sizes)) == 1:
+        images = empty_pixels((len(sizes), *sizes[0], channels), max_memory, device=device)
+        return images, images.unbind()
+    areas = [height * width for height, width in sizes]
+    images = empty_pixels((sum(areas), channels), max_memory, device=device)
+    return images, [part.view(*size, channels) for part, size in zip(images.split(areas), sizes)]
+
+
 def empty_pixels(shape: Sequence[int], max_memory: int = MAX_MEMORY, *, device: str | torch.device = "cpu") -> Tensor:
     """Contiguous uint8 of a shape, not initialised.
 

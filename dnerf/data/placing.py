@@ -74,11 +74,11 @@ def place(
     world_poses = similarity.poses_to_world(poses).float()
     frames = make_frames(world_poses, planes_between(world_poses, world))
     check_views(frames, torch.tensor(box), similarity)
-    unknown = [*_unknown(views, focus), *_beside_focus(views, focus, given)]
+    doubts = [*_cut_off(frames, world, given, fitted), unknown_parts(views, focus), _beside_focus(views, focus, given)]
     return replace(
         world,
         notes=(_about_box(world, frames, given), _about_planes(frames, world), f"up: {_short(up)}, {up_by}"),
-        warnings=(*_cut_off(frames, world, given, fitted), *unknown),
+        warnings=tuple(said for said in doubts if said is not None),
     )
 
 
@@ -216,23 +216,18 @@ def _cut_off(frames: Frames, world: World, given: Given, fitted: tuple[Similarit
     return said
 
 
-def _unknown(views: Viewpoints, focus: Tensor | None) -> list[str]:
-    said = unknown_parts(views, focus)
-    return [] if said is None else [said]
-
-
-def _beside_focus(views: Viewpoints, focus: Tensor | None, given: Given) -> list[str]:
+def _beside_focus(views: Viewpoints, focus: Tensor | None, given: Given) -> str | None:
     """Whether what the cameras look at is before or behind the given planes, as a sentence for a warning."""
     if focus is None:
-        return []
+        return None
     depth = float(depths_of(views, focus).median())
     if given.near is not None and depth <= given.near:
-        place = f"lies behind what the cameras look at, in a depth of {depth:.3g}"
-        return [f"data.near={given.near:g} {place}: set it to null"]
-    if given.far is not None and depth >= given.far:
-        place = f"lies before what the cameras look at, in a depth of {depth:.3g}"
-        return [f"data.far={given.far:g} {place}: set it to null"]
-    return []
+        plane = f"data.near={given.near:g} lies behind"
+    elif given.far is not None and depth >= given.far:
+        plane = f"data.far={given.far:g} lies before"
+    else:
+        return None
+    return f"{plane} what the cameras look at, in a depth of {depth:.3g}: set it to null"
 
 
 def _short(values: Sequence[float]) -> str:

@@ -176,9 +176,8 @@ def _intrinsics(value: Mapping[str, Any]) -> Intrinsics:
 
 
 def _world(value: Mapping[str, Any]) -> World:
-    corners = as_box([_numbers("box", corner, 3) for corner in value["box"]])  # checks them
-    assert corners.shape == (2, 3)
     low, high = (_vector("box", corner) for corner in value["box"])
+    as_box((low, high))  # checks it
     turn = value["similarity"]
     first, second, third = (_vector("rotation", row) for row in turn["rotation"])
     similarity = Similarity(
@@ -196,7 +195,7 @@ def _vector(name: str, values: Sequence[Any]) -> Vector:
 
 
 def _numbers(name: str, values: Sequence[Any], count: int | None = None) -> list[float]:
-    if not isinstance(values, list) or len(values) != (len(values) if count is None else count):
+    if not isinstance(values, list) or count not in (None, len(values)):
         raise ValueError(f"{name} must be {count} numbers, got {values!r}")
     for value in values:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):

@@ -54,15 +54,6 @@ class DataSource(ABC):
         """Raise what `frames` would of a split, as far as can be seen in little time; `NoImages` if it has none."""
         check_choice("split", split, SPLITS)
 
-    def _known(self, frames: Frames, split: str) -> Frames:
-        """The frames of a split that may be seen: training frames up to `train_end`, all others whole."""
-        if split != "train" or self.train_end is None:
-            return frames
-        kept = (frames.times <= self.train_end).nonzero()[:, 0].tolist()
-        if not kept:
-            raise ValueError(f"train_end must leave a training frame, got {self.train_end}, the first is later")
-        return frames.subset(kept)
-
 
 def given_box(box: str | Sequence[Sequence[float]]) -> Tensor | None:
     """Corners (2, 3) float64 of a box, None for "auto"; ValueError for anything else."""
@@ -140,7 +131,7 @@ class SyntheticData(DataSource):
             frames, self._train = self._train, None
             return frames
         poses, times = self._views(split)
-        return self._known(render_frames(self.scene, poses, times, self.resolution, background=self.background), split)
+        return render_frames(self.scene, poses, times, self.resolution, background=self.background)
 
     def world(self) -> World:
         """Exact scenes are made in world units: their similarity is the identity."""
@@ -162,14 +153,13 @@ class SyntheticData(DataSource):
     def cameras(self) -> dict[str, CameraSet]:
         """See `DataSource.cameras`."""
         lens = Intrinsics.from_angle(self.resolution, self.resolution, DNERF_ANGLE_X)
-        result = {}
-        for split in SPLITS:
-            poses, times = self._views(split)
-            if split == "train" and self.train_end is not None:
-                poses, times = poses[times <= self.train_end], times[times <= self.train_end]
-            result[split] = CameraSet(poses, times, (lens,) * len(times))
-        return result
+        views = {split: self._views(split) for split in SPLITS}
+        return {split: CameraSet(poses, times, (lens,) * len(times)) for split, (poses, times) in views.items()}
 
     def _views(self, split: str) -> tuple[Tensor, Tensor]:
+        """Poses and times of a split; of training up to `train_end`, which leaves the first, at 0, in any case."""
         seed = self.seed + 1000 * SPLITS.index(split)
-        return random_views(self.num_frames[split], midway=split != "train", seed=seed)
+        poses, times = random_views(self.num_frames[split], midway=split != "train", seed=seed)
+        if split == "train" and self.train_end is not None:
+            return poses[times <= self.train_end], times[times <= self.train_end]
+        return poses, times

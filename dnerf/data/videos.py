@@ -29,11 +29,8 @@ class VideoHeader(NamedTuple):
 
 def read_video_header(path: Path) -> VideoHeader:
     """Size, rate and number of frames of a video file; counting decodes it. ValueError as `read_frames`."""
-    import imageio_ffmpeg
-
     width, height, fps = _facts(path.resolve(), _stamp(path))
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), *INPUT, "-i", f"file:{path.resolve()}", *OUTPUT]
-    run = subprocess.run([*command, "-progress", "-", "-f", "null", "-"], capture_output=True, check=False)
+    run = _decoded_all(path, "-progress", "-")
     counts = [line[6:] for line in run.stdout.decode(errors="replace").splitlines() if line.startswith("frame=")]
     if run.returncode or not counts or not counts[-1].strip().isdigit() or int(counts[-1]) == 0:
         raise ValueError(f"{path}: video cannot be decoded: {_last_line(run.stderr.decode(errors='replace'))}")
@@ -45,16 +42,21 @@ def read_frame_times(path: Path) -> list[float]:
 
     Raises ValueError as `read_frames`, or if the file states no times.
     """
-    import imageio_ffmpeg
-
     _facts(path.resolve(), _stamp(path))  # what is broken or too large is said in one way
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), *INPUT, "-i", f"file:{path.resolve()}", *OUTPUT]
-    run = subprocess.run([*command, "-vf", "showinfo=checksum=0", "-f", "null", "-"], capture_output=True, check=False)
+    run = _decoded_all(path, "-vf", "showinfo=checksum=0")
     times = [float(time) for time in re.findall(rb" pts_time:(-?[0-9.]+(?:e[-+]?[0-9]+)?)", run.stderr)]
     if not times:
         last = _last_line(run.stderr.decode(errors="replace"))
         raise ValueError(f"{path}: video states no times of its frames: {last}")
     return times
+
+
+def _decoded_all(path: Path, *options: str) -> subprocess.CompletedProcess[bytes]:
+    """What ffmpeg says while it decodes a video and keeps nothing."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *INPUT, "-i", f"file:{path.resolve()}", *OUTPUT, *options]
+    return subprocess.run([*command, "-f", "null", "-"], capture_output=True, check=False)
 
 
 def video_size(path: Path) -> tuple[int, int]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics
 from dnerf.data.normalization import Vector
+from dnerf.data.pixel_layout import evenly_spread
 
 CLEAR = 0.25  # of the second smallest share of cameras' right axes along a direction: what the smallest may be at most
 LEVEL = 0.02  # second smallest share from which right axes span a plane
@@ -158,8 +159,8 @@ def _depth_of_origin(views: Viewpoints) -> float | None:
 
 def _planes_of_points(views: Viewpoints, points: Tensor) -> tuple[float, float] | None:
     points = points[points.isfinite().all(-1)].double()
-    points = points[_evenly(len(points), MAX_POINTS)] if len(points) else points
-    chosen = _evenly(len(views.positions), MAX_VIEWS)
+    points = points[evenly_spread(len(points), MAX_POINTS)] if len(points) else points
+    chosen = evenly_spread(len(views.positions), MAX_VIEWS)
     depths = ((points[None] - views.positions[chosen, None]) * views.forward[chosen, None]).sum(-1).reshape(-1)
     depths = depths[depths > 0].sort().values
     if not len(depths):
@@ -207,7 +208,3 @@ def _distinct(positions: Tensor, tolerance: float) -> Tensor:
             break
         places = torch.cat([places, positions[distances.argmax()][None]])
     return places
-
-
-def _evenly(count: int, most: int) -> Tensor:
-    return torch.linspace(0, count - 1, min(count, most)).round().long()

@@ -10,6 +10,7 @@ from dnerf.data.background_check import background_color
 from dnerf.data.bounds import fit_box
 from dnerf.data.carving import Silhouettes
 from dnerf.data.frames import Frames
+from dnerf.data.pixel_layout import evenly_spread
 
 MAX_RAYS = 1000  # of outlines
 MAX_VIEWS = 60  # evenly spread
@@ -74,8 +75,7 @@ class SurroundingsEvidence(Evidence):
 
 def unexplained_share(frames: Frames) -> float:
     """The share of outlines' rays without a position that nearly all views see as not empty."""
-    chosen = torch.linspace(0, len(frames) - 1, min(len(frames), MAX_VIEWS)).round().long().tolist()
-    views = frames.subset(chosen) if len(chosen) < len(frames) else frames
+    views = frames if len(frames) <= MAX_VIEWS else frames.subset(evenly_spread(len(frames), MAX_VIEWS))
     rays = Silhouettes.of(views).outlines()[1]
     enter, leave = ray_box(rays.origins, rays.directions, fit_box(frames))
     enter, leave = enter.maximum(rays.near), leave.minimum(rays.far)

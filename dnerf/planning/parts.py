@@ -40,6 +40,7 @@ class Part:
         self.question, self.default, self.at, self.evidence = question, default, at, evidence
         self.candidates = {name: tuple(overrides) for name, overrides in candidates.items()}
         self.only_if = dict(only_if or {})
+        self.simplest = next(iter(self.candidates))
 
     def arises(self, choices: Mapping[str, str]) -> bool:
         """Whether the choices made so far leave the question open."""

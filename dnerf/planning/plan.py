@@ -13,7 +13,6 @@ from dnerf.data.frames import Frames
 from dnerf.planning.parts import Part
 
 FILE = "plan.yaml"
-WAYS = ("given", "images", "trial", "default")
 MAX_BYTES = 64 * 1024
 
 

@@ -60,9 +60,10 @@ class _Planner:
         self.decisions: dict[str, Decision] = {}
         self.standing = {name: Finding(part.default, "") for name, part in parts.items()}
         self.leading: Contender | None = None
-        for name in sorted(parts, key=lambda name: parts[name].at):
+        order = sorted(parts, key=lambda name: parts[name].at)
+        for name in order:
             self._without_training(name, given.get(name))
-        self.tried = [name for name in sorted(parts, key=lambda name: parts[name].at) if name not in self.decisions]
+        self.tried = [name for name in order if name not in self.decisions]
 
     def _without_training(self, name: str, given: str | None) -> None:
         part = self.parts[name]
@@ -70,7 +71,7 @@ class _Planner:
         if given is not None:
             self.decisions[name] = Decision(given, "given", "as set")
         elif not part.arises(self._choices()):
-            self.decisions[name] = Decision(next(iter(part.candidates)), "default", "the question does not arise")
+            self.decisions[name] = Decision(part.simplest, "default", "the question does not arise")
         elif part.evidence is not None and (finding := part.evidence.find(self.frames)) is not None:
             seconds = time.perf_counter() - begin
             if finding.is_certain:
@@ -84,7 +85,7 @@ class _Planner:
         choices |= {name: decision.choice for name, decision in self.decisions.items()} | tried
         for name, part in self.parts.items():
             if name not in self.decisions and not part.arises(choices):
-                choices[name] = next(iter(part.candidates))
+                choices[name] = part.simplest
         return choices
 
     def decide(self) -> tuple[Plan, Run | None]:
@@ -93,8 +94,7 @@ class _Planner:
         for number, name in enumerate(self.tried):
             part = self.parts[name]
             if not part.arises(self._choices()):
-                simplest = next(iter(part.candidates))
-                self.decisions[name] = Decision(simplest, "default", "the question does not arise")
+                self.decisions[name] = Decision(part.simplest, "default", "the question does not arise")
             elif halves is None:
                 self.decisions[name] = self._untried(name, f"{len(self.frames)} frames are too few to try")
             else:
@@ -116,18 +116,18 @@ class _Planner:
         others = [choice for choice in part.candidates if choice != standing]
         simpler = others[: list(part.candidates).index(standing)]
         leading.choice = standing
-        contenders = [leading]
-        for choice in others:
-            contenders.append(leading.forked(choice, self.make, self._choices(**{name: choice}), learnt, self.seed))
+        forked = (leading.forked(c, self.make, self._choices(**{name: c}), learnt, self.seed) for c in others)
+        contenders = [leading, *forked]
         before, first = [contender.run.seconds for contender in contenders], leading.run.step
         result = contest(contenders, HeldOut.of(held, self.seed), effort, simpler)
-        winner, better, error = result.winner, result.gain, result.error
-        spent = (c.run.seconds - b for c, b in zip(contenders, before, strict=True) if c is not winner)
-        lost = result.seconds + sum(spent)
-        self.lost_steps += sum(c.run.step - first for c in contenders if c is not winner)
-        second = "the others" if len(contenders) > 2 else next(c.choice for c in contenders if c is not winner)
+        winner = result.winner
+        losers = [(c, seconds) for c, seconds in zip(contenders, before, strict=True) if c is not winner]
+        lost = result.seconds + sum(loser.run.seconds - seconds for loser, seconds in losers)
+        self.lost_steps += sum(loser.run.step - first for loser, _ in losers)
+        second = "the others" if len(losers) > 1 else losers[0][0].choice
         why = f"{effort.num_steps} steps, on held-out pixels, against {second}"
-        finite = {"gain": better, "error": error} if math.isfinite(better + error) else {}
+        is_finite = math.isfinite(result.gain + result.error)
+        finite = {"gain": result.gain, "error": result.error} if is_finite else {}
         self.decisions[name] = Decision(winner.choice, "trial", why, seconds=lost, **finite)
         winner.run.seconds += lost
         winner.run.callbacks = leading.run.callbacks

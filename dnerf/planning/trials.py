@@ -192,7 +192,9 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simp
         begin = time.perf_counter()
         inside = held
         for contender in left:
-            inside = inside.within(_times_in(contender))
+            frames_in = contender.trainer.frames_in(contender.run.progress)  # None for all
+            times = contender.run.frames.times
+            inside = inside.within(times if frames_in is None else times[frames_in])
         for contender in left:
             contender.compare(inside)
         seconds += time.perf_counter() - begin
@@ -210,9 +212,3 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simp
         return Result(standing, -mean, error, seconds)
     second = min((c for c in left if c is not standing), key=lambda c: float(c.errors.mean()))
     return Result(standing, *gain(standing.errors, second.errors), seconds)
-
-
-def _times_in(contender: Contender) -> Tensor:
-    """Times of the frames that training has seen."""
-    run, frames_in = contender.run, contender.trainer.frames_in(contender.run.progress)
-    return run.frames.times if frames_in is None else run.frames.times[frames_in]

@@ -1,12 +1,12 @@
 """Writing a data set: D-NeRF's format, and nerfstudio's."""
 
-import json
 import math
 import os
 import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,12 @@ from PIL import Image
 from dnerf.core.backgrounds import parse_color
 from dnerf.core.cameras import Intrinsics
 from dnerf.core.checks import check_choice
+from dnerf.core.files import write_json
+from dnerf.data.capture import SPLITS
 from dnerf.data.formats.keys import COEFFICIENTS
 from dnerf.data.frames import Frames
 from dnerf.data.images import straight_alpha
-
-SPLITS = ("train", "val", "test")
-MAX_THREADS = 4
+from dnerf.data.loading import MAX_THREADS, in_threads
 
 
 def save_blender(frames_by_split: Mapping[str, Frames], root: str | Path) -> None:
@@ -46,16 +46,14 @@ def save_blender(frames_by_split: Mapping[str, Frames], root: str | Path) -> Non
                 "save_transforms writes them"
             )
 
-    def write(folder: Path) -> None:
+    with _new_folder(frames_by_split, root) as folder:
         for split, frames in frames_by_split.items():
             names = [f"./{split}/r_{index:03d}" for index in range(len(frames))]
             _write_images(frames, [f"{name}.png" for name in names], folder)
             camera = frames.intrinsics[0]
             angle = 2 * math.atan(0.5 * camera.width / camera.focal_x)
             fields = {"camera_angle_x": angle, **_lens(camera), **_shared(frames), "frames": _listed(frames, names)}
-            _write_json(folder / f"transforms_{split}.json", fields)
-
-    _save(frames_by_split, root, write)
+            write_json(folder / f"transforms_{split}.json", fields)
 
 
 def save_transforms(frames_by_split: Mapping[str, Frames], root: str | Path) -> None:
@@ -78,17 +76,15 @@ def save_transforms(frames_by_split: Mapping[str, Frames], root: str | Path) -> 
         raise ValueError("near, far, pixel_origin and background must be the same in all of frames_by_split")
     lens_model(cameras)  # checks them
 
-    def write(folder: Path) -> None:
-        lists: dict[str, Any] = {}
-        listed: list[dict[str, Any]] = []
+    lists: dict[str, Any] = {}
+    listed: list[dict[str, Any]] = []
+    with _new_folder(frames_by_split, root) as folder:
         for split, frames in frames_by_split.items():
             names = [f"images/{split}_{index:05d}.png" for index in range(len(frames))]
             _write_images(frames, names, folder)
             lists[f"{split}_filenames"] = names
             listed += _listed(frames, names)
-        _write_json(folder / "transforms.json", transforms_fields(listed, cameras, shared[0] | lists))
-
-    _save(frames_by_split, root, write)
+        write_json(folder / "transforms.json", transforms_fields(listed, cameras, shared[0] | lists))
 
 
 def transforms_fields(
@@ -120,8 +116,9 @@ def lens_model(cameras: Sequence[Intrinsics]) -> str:
     return "FULL_OPENCV" if is_full else "OPENCV"
 
 
-def _save(frames_by_split: Mapping[str, Frames], root: str | Path, write: Callable[[Path], None]) -> None:
-    """Have `write` fill a temporary folder that becomes `root`, if the frames can be saved."""
+@contextmanager
+def _new_folder(frames_by_split: Mapping[str, Frames], root: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder that becomes `root` when the block ends well; ValueError for frames not to be saved."""
     root = Path(os.path.realpath(root))
     if not frames_by_split:
         raise ValueError("frames_by_split must hold at least one split, got none")
@@ -140,14 +137,13 @@ def _save(frames_by_split: Mapping[str, Frames], root: str | Path, write: Callab
         # A folder inside the temporary one has the usual permissions; the temporary one itself is private.
         folder = Path(temporary) / root.name
         folder.mkdir()
-        write(folder)
+        yield folder
         if root.is_dir():
             root.rmdir()
         folder.rename(root)
 
 
 def _write_images(frames: Frames, names: list[str], folder: Path) -> None:
-    """Write each frame's PNG; the first failure, in the frames' order, is raised and the rest cancelled."""
     (folder / names[0]).parent.mkdir(parents=True, exist_ok=True)
 
     def write(index: int) -> None:
@@ -155,19 +151,7 @@ def _write_images(frames: Frames, names: list[str], folder: Path) -> None:
         image = Image.fromarray(straight_alpha(pixels) if frames.has_alpha else pixels)
         image.save(folder / names[index])
 
-    with ThreadPoolExecutor(MAX_THREADS) as pool:
-        futures = [pool.submit(write, index) for index in range(len(frames))]
-        try:
-            for future in futures:
-                future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _write_json(path: Path, fields: dict[str, Any]) -> None:
-    kept = {name: value for name, value in fields.items() if value is not None}
-    path.write_text(json.dumps(kept, indent=1, allow_nan=False))
+    in_threads([partial(write, index) for index in range(len(frames))], MAX_THREADS)
 
 
 def _listed(frames: Frames, names: list[str]) -> list[dict[str, Any]]:
@@ -179,12 +163,13 @@ def _listed(frames: Frames, names: list[str]) -> list[dict[str, Any]]:
 
 
 def _shared(frames: Frames) -> dict[str, Any]:
-    """What a file says of all of its frames, None where it is the default."""
-    origin = frames.intrinsics[0].pixel_origin
-    return {
-        "near": frames.near, "far": frames.far, "pixel_origin": None if origin == "center" else origin,
-        "background": None if frames.background is None else parse_color(frames.background),
-    }  # fmt: skip
+    """What a file says of all of its frames."""
+    fields: dict[str, Any] = {"near": frames.near, "far": frames.far}
+    if frames.intrinsics[0].pixel_origin != "center":
+        fields["pixel_origin"] = frames.intrinsics[0].pixel_origin
+    if frames.background is not None:
+        fields["background"] = parse_color(frames.background)
+    return fields
 
 
 def _is_fisheye(camera: Intrinsics) -> bool:
