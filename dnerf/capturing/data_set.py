@@ -121,7 +121,7 @@ def _given_model(folder: Path, frames: Sequence[ChosenFrame]) -> Any:
         model = load_pycolmap().Reconstruction(folder)
     except (ValueError, RuntimeError, OSError) as error:
         raise ValueError(f"model: {folder} must hold cameras, images and points3D of COLMAP; {error}") from error
-    names = {frame.stem: frame.name for frame in frames}
+    names = {frame.name.removesuffix(".png"): frame.name for frame in frames}
     for image in model.images.values():
         name = names.get(Path(image.name).with_suffix("").as_posix())
         if name is None:
@@ -152,14 +152,13 @@ def _keep(models: Sequence[Any], num_frames: int, min_share: float, out_dir: Pat
 
 
 def _write_manifest(cameras: Sequence[CaptureFrame], frames: Sequence[ChosenFrame], out_dir: Path) -> None:
-    times = {frame.stem: frame.time for frame in frames}
+    times = {frame.name.removesuffix(".png"): frame.time for frame in frames}
     listed = [{"file_path": f"images/{c.name}.png", "time": times[c.name], "transform_matrix": c.pose} for c in cameras]
     fields = transforms_fields(listed, [camera.intrinsics for camera in cameras], {"ply_file_path": POINTS})
     write_json(out_dir / MANIFEST, fields)
 
 
 def _report(found: dict[str, Any], cameras: Sequence[CaptureFrame], folder: Path) -> list[str]:
-    """How good it is, in lines."""
     placed, total, error = found["parts"][0], found["frames"], found["error"]
     lens = cameras[0].intrinsics
     ratio = max(lens.width / lens.focal_x, lens.height / lens.focal_y)

@@ -9,8 +9,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from dnerf.core.files import atomic_path
-from dnerf.data.formats.folder import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from dnerf.data.formats.names import frame_numbers
+from dnerf.data.formats.folder import IMAGE_SUFFIXES, VIDEO_SUFFIXES, frame_numbers, is_seen
 from dnerf.data.images import Bytes, read_header, read_image
 from dnerf.data.videos import read_frame_times, read_frames
 
@@ -25,11 +24,6 @@ class ChosenFrame:
     time: float  # seconds of its film, or the number in its name
     film: int  # index of its camera
     size: tuple[int, int]  # width and height
-
-    @property
-    def stem(self) -> str:
-        """The name without its suffix, by which models and masks know the frame."""
-        return self.name.removesuffix(".png")
 
 
 @dataclass(frozen=True)
@@ -78,7 +72,7 @@ def find_films(video: Path | None = None, images: Path | None = None) -> list[Fi
         raise ValueError(f"video: {video} does not exist; give a video file, or a folder of one for each camera")
     files = [video]
     if video.is_dir():
-        files = sorted(file for file in video.iterdir() if _is_seen(file, VIDEO_SUFFIXES))
+        files = sorted(file for file in video.iterdir() if is_seen(file, VIDEO_SUFFIXES))
         if not files or len({file.stem for file in files}) < len(files):
             raise ValueError(f"video: {video} must hold videos of different names; if it holds images, images={video}")
     for file in files:
@@ -87,13 +81,8 @@ def find_films(video: Path | None = None, images: Path | None = None) -> list[Fi
     return [Film(file.stem if video.is_dir() else "", file) for file in files]
 
 
-def _is_seen(path: Path, suffixes: tuple[str, ...]) -> bool:
-    """Whether a file's name has one of the suffixes, and is not hidden: those are of programs."""
-    return path.name.endswith(suffixes) and not path.name.startswith(".")
-
-
 def _film_of_images(folder: Path) -> Film:
-    paths = sorted(path for path in folder.rglob("*") if _is_seen(path, IMAGE_SUFFIXES) and path.is_file())
+    paths = sorted(path for path in folder.rglob("*") if is_seen(path, IMAGE_SUFFIXES) and path.is_file())
     names = _stems(folder, paths)
     if len(paths) < 2 or len(set(names)) < len(paths):
         raise ValueError(f"images: {folder} must hold PNG or JPEG images of different names, got {len(paths)}")

@@ -86,10 +86,10 @@ def find_structure(
 def _masks(frames: Sequence[ChosenFrame], target: Path, masks: Path) -> Path:
     """A folder of masks as COLMAP wants them, each named as its image and `.png`."""
     for frame in frames:
-        paths = [masks / f"{frame.stem}{end}" for end in (".png", ".jpg", ".png.png")]
-        found = next((path for path in paths if path.is_file()), None)
+        stem = frame.name.removesuffix(".png")
+        found = next((path for end in (".png", ".jpg", ".png.png") if (path := masks / f"{stem}{end}").is_file()), None)
         if found is None:
-            raise ValueError(f"masks: {masks} must hold a mask for each frame, {frame.stem}.png is missing")
+            raise ValueError(f"masks: {masks} must hold a mask for each frame, {stem}.png is missing")
         kept = np.where(read_mask(found, frame.size) > 127, 255, 0).astype(np.uint8)
         (target / frame.name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(kept).save(target / f"{frame.name}.png")
@@ -149,7 +149,6 @@ def _check_matches(database: Path, frames: Sequence[ChosenFrame]) -> None:
 
 
 def _map(database: Path, images: Path, unfinished: Path, num_frames: int) -> list[Any]:
-    """All models."""
     pycolmap = load_pycolmap()
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()

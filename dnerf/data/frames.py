@@ -11,8 +11,7 @@ from dnerf.core.cameras import Camera, Intrinsics, camera_rays
 from dnerf.core.checks import check_shape
 from dnerf.core.frame_intrinsics import FrameIntrinsics
 from dnerf.core.rays import Rays
-from dnerf.data.pixel_layout import PixelLayout
-from dnerf.data.pixel_store import empty_images
+from dnerf.data.pixel_layout import PixelLayout, empty_images
 
 RIGID_TOLERANCE = 1e-3
 

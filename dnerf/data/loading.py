@@ -22,7 +22,7 @@ from dnerf.data.images import (
     read_header,
     read_image,
 )
-from dnerf.data.pixel_store import MAX_MEMORY, empty_images
+from dnerf.data.pixel_layout import MAX_MEMORY, empty_images
 from dnerf.data.videos import read_frames, video_size
 
 DEFAULT_WIDTH = 400  # in pixels, unless told: D-NeRF's protocol

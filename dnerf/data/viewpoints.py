@@ -21,7 +21,7 @@ IN_FRONT = 0.8  # share of the cameras that have what they look at in front of t
 DEPTHS = (0.5, 1.5)  # planes in terms of the depth that cameras look at
 AROUND = 0.5  # of the depth that cameras look at: how far apart cameras stand that go around it
 OF_POINTS = (0.8, 1.2)  # planes in terms of the depths of sparse points
-QUANTILE = 0.01  # of those depths, at either end, that may be wrong
+ENDS = (0.01, 0.99)  # quantiles of those depths, beyond which they may be wrong
 GUESSED = (0.5, 10.0)  # planes in terms of how far apart cameras stand, where they look side by side or outwards
 SAME_PLACE = 0.01  # of the distance to what is looked at: closer cameras are one viewpoint
 LOOKED_AT = math.cos(math.radians(35.0))  # between a view axis and the direction of what counts as looked at
@@ -46,8 +46,7 @@ class Viewpoints:
         rotation = poses[:, :3, :3].double()
         shifts = []
         for lens in intrinsics:
-            x = lens.width / 2 if lens.center_x is None else lens.center_x
-            y = lens.height / 2 if lens.center_y is None else lens.center_y
+            x, y = lens.center
             column, row = min(max(x, 0), lens.width), min(max(y, 0), lens.height)
             shifts.append([(column - x) / lens.focal_x, (y - row) / lens.focal_y, -1.0])
         local = torch.tensor(shifts, dtype=torch.float64)
@@ -128,8 +127,7 @@ def find_planes(views: Viewpoints, points: Tensor | None) -> tuple[float, float,
     focus = common_focus(views)
     if focus is not None:
         depths = depths_of(views, focus)
-        ends = torch.tensor([QUANTILE, 1 - QUANTILE], dtype=torch.float64)
-        nearest, farthest = torch.quantile(depths[depths > 0], ends).tolist()
+        nearest, farthest = torch.quantile(depths[depths > 0], depths.new_tensor(ENDS)).tolist()
         return DEPTHS[0] * nearest, DEPTHS[1] * farthest, "from what the cameras look at"
     origin = _depth_of_origin(views)
     if views.spread > SAME_PLACE * (origin or 0.0):
@@ -148,7 +146,7 @@ def reach_around(views: Viewpoints, focus: Tensor) -> float:
     depths = depths_of(views, focus)
     if views.spread < AROUND * float(depths.median()):
         return math.inf
-    return DEPTHS[1] * float(torch.quantile(depths[depths > 0], 1 - QUANTILE))
+    return DEPTHS[1] * float(torch.quantile(depths[depths > 0], ENDS[1]))
 
 
 def _depth_of_origin(views: Viewpoints) -> float | None:
@@ -159,14 +157,13 @@ def _depth_of_origin(views: Viewpoints) -> float | None:
 
 def _planes_of_points(views: Viewpoints, points: Tensor) -> tuple[float, float] | None:
     points = points[points.isfinite().all(-1)].double()
-    points = points[evenly_spread(len(points), MAX_POINTS)] if len(points) else points
+    points = points[evenly_spread(len(points), MAX_POINTS)]
     chosen = evenly_spread(len(views.positions), MAX_VIEWS)
     depths = ((points[None] - views.positions[chosen, None]) * views.forward[chosen, None]).sum(-1).reshape(-1)
-    depths = depths[depths > 0].sort().values
+    depths = depths[depths > 0]
     if not len(depths):
         return None
-    last = len(depths) - 1
-    near, far = (float(depths[round(share * last)]) for share in (QUANTILE, 1 - QUANTILE))
+    near, far = torch.quantile(depths, depths.new_tensor(ENDS), interpolation="nearest").tolist()
     return OF_POINTS[0] * near, OF_POINTS[1] * far
 
 

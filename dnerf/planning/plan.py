@@ -18,23 +18,14 @@ MAX_BYTES = 64 * 1024
 
 @dataclass(frozen=True)
 class Decision:
-    """What was decided about one part.
+    """What was decided about one part."""
 
-    Args:
-        choice: name of the candidate.
-        by: "given" by the user, found in "images", in a "trial", or the "default" where nothing decided.
-        why: in a few words.
-        gain: of the choice over the next best candidate on held-out pixels, in dB; None without a trial.
-        error: standard error of that, in dB.
-        seconds: that the decision took, winner's steps left out.
-    """
-
-    choice: str
-    by: str
-    why: str
-    gain: float | None = None
-    error: float | None = None
-    seconds: float = 0.0
+    choice: str  # name of the candidate
+    by: str  # "given" by the user, found in "images", in a "trial", or the "default" where nothing decided
+    why: str  # in a few words
+    gain: float | None = None  # over the next best candidate on held-out pixels, in dB; None without a trial
+    error: float | None = None  # standard error of that, in dB
+    seconds: float = 0.0  # that the decision took, winner's steps left out
 
 
 @dataclass(frozen=True)

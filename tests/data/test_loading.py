@@ -17,7 +17,7 @@ from dnerf.core.lenses import Distortion
 from dnerf.data.capture import CaptureFrame, ImageFile
 from dnerf.data.images import premultiplied_area_average
 from dnerf.data.loading import final_intrinsics, load_frames
-from dnerf.data.pixel_store import empty_pixels
+from dnerf.data.pixel_layout import empty_pixels
 from dnerf.data.videos import read_frames, read_video_header, video_size
 
 POSE = tuple(tuple(row) for row in torch.eye(4).tolist())
@@ -222,7 +222,7 @@ import resource, sys
 import torch
 from dnerf.core.cameras import Intrinsics
 from dnerf.data.frames import Frames
-from dnerf.data.pixel_store import empty_pixels
+from dnerf.data.pixel_layout import empty_pixels
 
 num_frames, height, width = 100, 540, 960
 images = empty_pixels((num_frames, height, width, 3), 2**20)

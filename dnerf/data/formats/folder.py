@@ -1,12 +1,12 @@
-"""Files that a data set names, found inside its folder and nowhere else."""
+"""Files that a data set names, found inside its folder and nowhere else, and the frame numbers in their names."""
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from dnerf.data.formats.json_files import Notes, short, text
-from dnerf.data.formats.names import frame_numbers
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 OTHER_SUFFIXES = (".webp", ".gif", ".tif", ".tiff", ".bmp", ".exr", ".heic", ".avif")  # of images not read
@@ -14,6 +14,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".MP4", ".MOV", ".AVI
 REDUCED = ("images_2", "images_4", "images_8")  # what COLMAP's and nerfstudio's tools write beside images/
 MAX_PARTS = 64
 MAX_NAME_BYTES = 255  # what file systems allow
+MAX_DIGITS = 15  # more are exact in no float64
 
 
 class Folder:
@@ -71,7 +72,7 @@ class Folder:
         """Files of these suffixes in a folder, by name; none where it is not there."""
         if not folder.is_dir():
             return []
-        paths = sorted(p for p in folder.iterdir() if p.name.endswith(suffixes) and not p.name.startswith("."))
+        paths = sorted(path for path in folder.iterdir() if is_seen(path, suffixes))
         return [self.inside(path, str(folder)) for path in paths if path.is_file()]
 
     def other_kind(self, path: Path) -> Path | None:
@@ -132,3 +133,24 @@ class Folder:
                     self.notes.add(f"{self.root}: images that are not in images/ were read from {reduced}/")
                     return path
         return None
+
+
+def is_seen(path: Path, suffixes: tuple[str, ...]) -> bool:
+    """Whether a file's name has one of the suffixes, and is not hidden: those are of programs."""
+    return path.name.endswith(suffixes) and not path.name.startswith(".")
+
+
+def frame_numbers(names: Sequence[str]) -> list[float] | None:
+    """The last number of each name that is not the same in all; None if a name has none, or the numbers tell nothing.
+
+    Names are those of files without suffix; of folders in them only the last part counts.
+    """
+    found = [re.findall(r"[0-9]+", name.rpartition("/")[2]) for name in names]
+    if not found or not all(found) or any(len(digits) > MAX_DIGITS for group in found for digits in group):
+        return None
+    fewest = min(len(group) for group in found)
+    for place in range(1, fewest + 1):
+        values = [float(group[-place]) for group in found]
+        if len(set(values)) > 1:
+            return values
+    return None

@@ -11,11 +11,10 @@ import numpy as np
 
 from dnerf.core.cameras import Intrinsics
 from dnerf.data.capture import Capture, CaptureFrame, ImageFile
-from dnerf.data.formats.folder import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Folder
+from dnerf.data.formats.folder import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Folder, frame_numbers
 from dnerf.data.formats.json_files import MAX_FRAMES, MAX_NUMBER, Notes, number, whole
 from dnerf.data.formats.manifest import uniquely_named
 from dnerf.data.formats.manifest_cameras import MAX_FOCAL_RATIO, MAX_SIDE
-from dnerf.data.formats.names import frame_numbers
 from dnerf.data.formats.points import read_npy
 from dnerf.data.formats.poses import rigid_pose
 from dnerf.data.videos import read_video_header

@@ -26,19 +26,12 @@ MODELS = {
 
 @dataclass(frozen=True)
 class LensFields:
-    """Fields about the camera of one frame.
+    """Fields about the camera of one frame."""
 
-    Args:
-        frame: the frame's own fields.
-        shared: the file's.
-        frame_place: the frame, for messages.
-        shared_place: the file, for messages.
-    """
-
-    frame: Mapping[str, Any]
-    shared: Mapping[str, Any]
-    frame_place: str
-    shared_place: str
+    frame: Mapping[str, Any]  # the frame's own fields
+    shared: Mapping[str, Any]  # the file's
+    frame_place: str  # the frame, for messages
+    shared_place: str  # the file, for messages
 
     def find(self, key: str) -> tuple[Any, str]:
         """A field's value, None if it is nowhere, and its place."""
@@ -187,7 +180,6 @@ def _of_angle(value: Any, place: str, size: int) -> float:
 
 
 def _of_matrix(value: Any, place: str, width: int, height: int) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point of a camera matrix."""
     values = matrix(value, place, ((3, 3), (3, 4), (4, 4)))
     focal_x = _in_pixels(float(values[0, 0]), f"{place}[0][0]", width)
     focal_y = _in_pixels(float(values[1, 1]), f"{place}[1][1]", height)

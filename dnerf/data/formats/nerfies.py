@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics
 from dnerf.core.lenses import Distortion
 from dnerf.data.capture import Capture, CaptureFrame, ImageFile
-from dnerf.data.formats.folder import Folder
+from dnerf.data.formats.folder import Folder, frame_numbers
 from dnerf.data.formats.json_files import (
     MAX_FRAMES,
     MAX_NUMBER,
@@ -30,7 +29,6 @@ from dnerf.data.formats.json_files import (
 )
 from dnerf.data.formats.manifest import direction, stated_planes
 from dnerf.data.formats.manifest_cameras import MAX_COEFFICIENT, MAX_FOCAL_RATIO, MAX_SIDE, MAX_SKEW
-from dnerf.data.formats.names import frame_numbers
 from dnerf.data.formats.points import as_points, read_npy
 from dnerf.data.formats.poses import Pose, from_opencv, rigid_pose
 
@@ -67,9 +65,11 @@ def read(root: Path) -> Capture:
         )
         for split, names in ids_by_split.items()
     }
+    points, extra = root / "points.npy", root / "extra.json"
     return Capture(
-        root, "nerfies", splits, planes=_planes(root / "scene.json"), points=_points(root / "points.npy"),
-        up=_up(root / "extra.json"), notes=notes.lines(),
+        root, "nerfies", splits, planes=_planes(root / "scene.json"),
+        points=as_points(read_npy(points), str(points)) if points.exists() else None,
+        up=direction(read_object(extra).get("up"), f"{extra}: up") if extra.exists() else None, notes=notes.lines(),
     )  # fmt: skip
 
 
@@ -183,11 +183,3 @@ def _planes(path: Path) -> tuple[float, float] | None:
     fields = read_object(path)
     scale = number(fields.get("scale", 1.0), f"{path}: scale", 1 / MAX_NUMBER, MAX_NUMBER)
     return stated_planes(fields, path, scale)
-
-
-def _points(path: Path) -> Tensor | None:
-    return as_points(read_npy(path), str(path)) if path.exists() else None
-
-
-def _up(path: Path) -> tuple[float, float, float] | None:
-    return direction(read_object(path).get("up"), f"{path}: up") if path.exists() else None

@@ -177,7 +177,6 @@ def _is_fisheye(camera: Intrinsics) -> bool:
 
 
 def _lens(camera: Intrinsics) -> dict[str, Any]:
-    """What a file says of a camera."""
     lens = {
         "fl_x": camera.focal_x, "fl_y": camera.focal_y, "cx": camera.center_x, "cy": camera.center_y, "w": camera.width,
         "h": camera.height,
