@@ -76,7 +76,6 @@ class FolderData(DataSource):
         self.given = Given(given_box(box), near, far)
         self.format, self.axes, self.pixel_origin = format, axes, pixel_origin
         self.hold_out, self.times = hold_out, times
-        self._world: World | None = None
         self._train: LoadedFrames | None = None
 
     @cached_property
@@ -106,10 +105,6 @@ class FolderData(DataSource):
             self._train = self._load("train")
             self._world = self._placed(self._train)
         return self._world
-
-    def settle(self, world: World) -> None:
-        """See `DataSource.settle`."""
-        self._world = world
 
     def cameras(self) -> dict[str, CameraSet]:
         """See `DataSource.cameras`: of every split, with images or without."""

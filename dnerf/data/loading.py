@@ -55,7 +55,7 @@ class _Header:
     """How one frame's image is read."""
 
     frame: CaptureFrame  # with intrinsics at the final size
-    image: ImageFile
+    image: ImageFile  # its own, which is there
     size: tuple[int, int]  # width and height, decoded
     may_have_alpha: bool = False
     is_upright: bool = True  # turned as its EXIF data say

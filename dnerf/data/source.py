@@ -29,6 +29,7 @@ class DataSource(ABC):
     """Frames of a scene by split, in the world that models live in."""
 
     train_end: float | None = None  # last time that training frames may have; None for all
+    _world: World | None = None  # as settled, or found
 
     @abstractmethod
     def frames(self, split: str) -> Frames:
@@ -38,9 +39,9 @@ class DataSource(ABC):
     def world(self) -> World:
         """Where the scene stands in the world: as settled, else found from the training frames."""
 
-    @abstractmethod
     def settle(self, world: World) -> None:
         """Stand where a run of this scene has its world, rather than find one anew."""
+        self._world = world
 
     @abstractmethod
     def cameras(self) -> dict[str, CameraSet]:
@@ -120,7 +121,6 @@ class SyntheticData(DataSource):
             raise ValueError(f"seed must be a whole number, got {seed!r}")
         self.scene, self.resolution, self.train_end, self.seed = scene, resolution, train_end, seed
         self._box = given_box(box)
-        self._world: World | None = None
         self._train: Frames | None = None  # rendered to fit the box, and not yet taken
         self.background = None if background is None else parse_color(background)
 
@@ -145,10 +145,6 @@ class SyntheticData(DataSource):
             note = f"box: [{shown}], {by}"
             self._world = World(box, has_alpha=self.background is None, notes=(note,))
         return self._world
-
-    def settle(self, world: World) -> None:
-        """See `DataSource.settle`."""
-        self._world = world
 
     def cameras(self) -> dict[str, CameraSet]:
         """See `DataSource.cameras`."""

@@ -105,13 +105,8 @@ def _pose(image: RegisteredImage, where: str) -> Pose:
     if not bounded or not np.linalg.norm(values[:4]) > 1e-6:
         raise ValueError(f"{where}: quaternion and translation must be finite, got {short(values.tolist())}")
     w, x, y, z = values[:4] / np.linalg.norm(values[:4])
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])  # Rodrigues' formula: R = I + 2 w [v] + 2 [v]^2
+    rotation = np.eye(3) + 2 * w * across + 2 * across @ across
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ values[4:]
     return rigid_pose(from_opencv(pose), where, "images", Notes())
@@ -121,10 +116,10 @@ def _intrinsics(camera: CameraModel, where: str) -> Intrinsics:
     """A camera's intrinsics; ValueError for a lens that is not supported."""
     if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
         raise ValueError(f"{where}: width and height must be in 1..{MAX_SIDE}, got {camera.width} x {camera.height}")
-    two_focal_lengths = camera.model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
-    focal_y_index = 1 if two_focal_lengths else 0
-    focal_x, focal_y = camera.parameters[0], camera.parameters[focal_y_index]
-    center_x, center_y, *rest = camera.parameters[focal_y_index + 1 :]
+    parameters = camera.parameters
+    if camera.model not in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"):
+        parameters = (parameters[0], *parameters)  # one focal length stands for both
+    focal_x, focal_y, center_x, center_y, *rest = parameters
     for focal, size in ((focal_x, camera.width), (focal_y, camera.height)):
         if not size / MAX_FOCAL_RATIO <= focal <= size * MAX_FOCAL_RATIO:
             raise ValueError(f"{where}: focal length must fit {camera.width} x {camera.height}, got {focal:g}")

@@ -58,7 +58,9 @@ def read(root: Path) -> Capture:
         height, width = (whole(float(values[i, 4]), f"{where}: size", 1, MAX_SIDE) for i in (0, 1))
         focal = number(float(values[2, 4]), f"{where}: focal length", width / MAX_FOCAL_RATIO, width * MAX_FOCAL_RATIO)
         camera = Intrinsics(width, height, focal, focal)
-        frames += [CaptureFrame(_name(folder, image), pose, camera, image, None, time) for image, time in of_camera]
+        for image, time in of_camera:
+            name = folder.name(image.path) if image.frame is None else f"{image.path.stem}/{image.frame:05d}"
+            frames.append(CaptureFrame(name, pose, camera, image, None, time))
     near, far = float(rows[:, 15].min()), float(rows[:, 16].max())
     if not 0 <= near < far:
         notes.add(f"{path.name}: its near and far are not used, they are {near:g} and {far:g}")
@@ -66,10 +68,6 @@ def read(root: Path) -> Capture:
         path, "llff", {"all": uniquely_named(frames)}, planes=(near, far) if 0 <= near < far else None,
         notes=notes.lines(),
     )  # fmt: skip
-
-
-def _name(folder: Folder, image: ImageFile) -> str:
-    return folder.name(image.path) if image.frame is None else f"{image.path.stem}/{image.frame:05d}"
 
 
 def _images(folder: Folder, num_cameras: int) -> list[Images]:

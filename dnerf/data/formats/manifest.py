@@ -88,9 +88,9 @@ class Manifest:
             if own_size is None:
                 raise ValueError(f"{self.path}: w and h must be given, or an image be there, to know the images' size")
             camera = lens.intrinsics(*own_size)
+            camera = intrinsics.setdefault(camera, camera)
             image = ImageFile(found[0]) if found and any(there) else None
             name = self.folder.name(found[0]) if found else f"frame_{index:05d}"
-            camera = intrinsics.setdefault(camera, camera)
             frames.append(CaptureFrame(name, self._pose(index), camera, image, self._mask(index), times[index]))
         return uniquely_named(frames)
 

@@ -107,10 +107,10 @@ def transforms_fields(
 
 def lens_model(cameras: Sequence[Intrinsics]) -> str:
     """COLMAP's name of the lenses of a file, which has one for all; ValueError for fisheye lenses among others."""
-    fisheye = {_is_fisheye(camera) for camera in cameras}
-    if len(fisheye) > 1:
+    models = {"opencv" if camera.distortion is None else camera.distortion.model for camera in cameras}
+    if len(models) > 1:
         raise ValueError("frames_by_split must have fisheye lenses only, or none")
-    if fisheye == {True}:
+    if models == {"fisheye"}:
         return "OPENCV_FISHEYE"
     is_full = any(camera.distortion is not None and any(camera.distortion.coefficients[3:6]) for camera in cameras)
     return "FULL_OPENCV" if is_full else "OPENCV"
@@ -170,10 +170,6 @@ def _shared(frames: Frames) -> dict[str, Any]:
     if frames.background is not None:
         fields["background"] = parse_color(frames.background)
     return fields
-
-
-def _is_fisheye(camera: Intrinsics) -> bool:
-    return camera.distortion is not None and camera.distortion.model == "fisheye"
 
 
 def _lens(camera: Intrinsics) -> dict[str, Any]:
