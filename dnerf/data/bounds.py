@@ -14,6 +14,7 @@ from dnerf.data.pixel_layout import evenly_spread
 from dnerf.samplers import OccupiedCells
 
 ROOM = 0.03  # at each face, of the longest side: surfaces are softer in training than they are
+FEW_POINTS = 8  # fewer have no extent to speak of
 ROOM_AROUND_POINTS = 0.15  # they are few, and none lie on what moves
 QUANTILE = 0.01  # of sparse points, at either end of each axis, that may be wrong
 SHARES = (0.5, 0.1, 0.0)  # of the views, that see what the box has to hold: the first that is enough
@@ -50,7 +51,8 @@ def fit_box(frames: Frames, points: Tensor | None = None) -> Tensor:
         if not len(points):
             raise ValueError("points must hold a finite one, got none")
         share = share_of_views(frames, points)
-        points = points[share >= SHARES[1] * share.max()]
+        seen = points[share >= SHARES[1] * share.max()]
+        points = seen if len(seen) >= FEW_POINTS else points
         ends = torch.tensor([QUANTILE, 1 - QUANTILE], dtype=points.dtype, device=points.device)
         return _with_room(torch.quantile(points, ends, dim=0), ROOM_AROUND_POINTS)
     behind = background_color(frames)
