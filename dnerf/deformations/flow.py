@@ -76,7 +76,6 @@ class FlowDeformation(InvertibleDeformation):
 
     def inverse(self, canonical: Tensor, times: Tensor) -> Tensor:
         """World positions (..., 3) at times (...,) of canonical positions (..., 3); raises as `forward`."""
-        check_positions_times(canonical, times)
         if not self.corrections or not canonical.numel():
             return self.reverse(canonical, times)
 

@@ -11,8 +11,7 @@ from dnerf.core.files import write_text
 from dnerf.data.scene_record import SCENE, SceneRecord
 from dnerf.data.source import DataSource
 from dnerf.evaluation.scores import evaluate
-from dnerf.training.callbacks import Callback
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 from dnerf.visualization.video import comparison_sheet, write_png
 
 

@@ -141,8 +141,11 @@ def check_targets(node: Any, place: str = "", *, trusted: bool = False) -> None:
         ValueError: naming the place.
     """
     packages = [dnerf.__name__] if trusted else _trusted_packages()
-    for where, target in _targets(node, place):
-        where, shown = _joined(where, TARGET), repr(str(target)[:80])
+    for where, value in _nodes(node, place):
+        if not isinstance(value, Mapping) or TARGET not in value:
+            continue
+        target, where = value[TARGET], _joined(where, TARGET)
+        shown = repr(str(target)[:80])
         if not trusted and not _lies_in(str(target), packages):
             root = ascii(str(target).partition(".")[0][:40])[1:-1]
             raise ValueError(
@@ -156,15 +159,15 @@ def check_targets(node: Any, place: str = "", *, trusted: bool = False) -> None:
             raise ValueError(f"{where} must be a class, or an exact scene's maker, got {shown}")
 
 
-def _targets(node: Any, place: str) -> Iterator[tuple[str, Any]]:
+def _nodes(node: Any, place: str) -> Iterator[tuple[str, Any]]:
+    """A value of a config and all that it holds, each with its place, after what it lies in."""
+    yield place, node
     if isinstance(node, Mapping):
-        if TARGET in node:
-            yield place, node[TARGET]
         for key, value in node.items():
-            yield from _targets(value, _joined(place, key))
+            yield from _nodes(value, _joined(place, key))
     elif isinstance(node, list | tuple):
         for index, value in enumerate(node):
-            yield from _targets(value, f"{place}[{index}]")
+            yield from _nodes(value, f"{place}[{index}]")
 
 
 def _joined(place: str, key: object) -> str:
@@ -253,17 +256,13 @@ def _plain_yaml(path: Path) -> Any:
     return yaml.load(text, loader)
 
 
-def _check_plain(node: Any, place: str = "") -> None:
+def _check_plain(config: Any) -> None:
     """Raise unless keys are texts and values are numbers, texts or nothing, none of them an interpolation."""
-    if isinstance(node, dict):
-        for key, value in node.items():
+    for place, value in _nodes(config, ""):
+        for key in value if isinstance(value, dict) else ():
             if not isinstance(key, str) or not key.isprintable() or len(key) > MAX_KEY or "${" in key:
                 raise ValueError(f"{place or 'config'}: keys must be short texts, got {str(key)[:MAX_KEY]!r}")
-            _check_plain(value, _joined(place, key))
-    elif isinstance(node, list):
-        for index, value in enumerate(node):
-            _check_plain(value, f"{place}[{index}]")
-    elif node is not None and not isinstance(node, str | int | float):
-        raise ValueError(f"{place} must be a number, a text or null, got {type(node).__name__}")
-    elif isinstance(node, str) and "${" in node:
-        raise ValueError(f"{place} must be a resolved value, got an interpolation '${{'")
+        if value is not None and not isinstance(value, dict | list | str | int | float):
+            raise ValueError(f"{place} must be a number, a text or null, got {type(value).__name__}")
+        if isinstance(value, str) and "${" in value:
+            raise ValueError(f"{place} must be a resolved value, got an interpolation '${{'")
