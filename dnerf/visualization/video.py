@@ -128,7 +128,6 @@ def contact_sheet(
         columns: headings.
         rows: a label for each row, or none.
     """
-    check_positive("MARGIN", MARGIN)
     if not images or not columns or any(len(row) != len(columns) for row in images):
         raise ValueError(f"images must have rows of {len(columns)} > 0, got {[len(row) for row in images]}")
     if rows and len(rows) != len(images):
@@ -223,7 +222,7 @@ def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> N
 
 def _write_folder(frames: Iterator[NDArray[np.uint8]], path: Path) -> None:
     path = Path(os.path.abspath(path))
-    if os.path.lexists(path) and not (path.is_dir() and all(_is_frame(file.name) for file in path.iterdir())):
+    if os.path.lexists(path) and not (path.is_dir() and all(file.match("frame_*.png") for file in path.iterdir())):
         raise ValueError(f"path must be a new folder or one of earlier frames, got {path}, which holds other things")
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
@@ -234,7 +233,3 @@ def _write_folder(frames: Iterator[NDArray[np.uint8]], path: Path) -> None:
         if path.is_dir():
             path.rename(replaced)
         unfinished.rename(path)
-
-
-def _is_frame(name: str) -> bool:
-    return name.startswith("frame_") and name.endswith(".png")
