@@ -32,17 +32,11 @@ NAMED = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A finished run.
+    """A finished run."""
 
-    Args:
-        renderer: the trained model, in evaluation mode.
-        config: what it was built and trained by, as plain values.
-        folder: where it lies.
-    """
-
-    renderer: Renderer
-    config: dict[str, Any]
-    folder: Path
+    renderer: Renderer  # the trained model, in evaluation mode
+    config: dict[str, Any]  # what it was built and trained by, as plain values
+    folder: Path  # where it lies
 
     def data(self) -> DataSource:
         """Where its frames come from; `config["data"]["root"]` may be set before, if a data set has moved.
@@ -184,11 +178,7 @@ def _lies_in(name: str, packages: list[str]) -> bool:
 
 
 def _find(target: Any, place: str) -> Any:
-    """What a dotted name means.
-
-    Raises:
-        ValueError: if its module cannot be imported, or has no such thing.
-    """
+    """What a dotted name means; ValueError if its module cannot be imported, or has no such thing."""
     module_name, _, name = str(target).rpartition(".")
     try:
         return getattr(importlib.import_module(module_name), name)
@@ -207,38 +197,30 @@ def _built(node: Any, place: str) -> Any:
 
 
 def _called(make: Any, arguments: dict[str, Any], place: str) -> Any:
-    """An object, from arguments by name.
-
-    Raises:
-        ValueError: naming the place, whatever the class raises.
-    """
+    """An object, from arguments by name; ValueError, naming the place, whatever the class raises."""
     try:
-        parameters = inspect.signature(make).parameters
-        _check_arguments(make, parameters, arguments, place)
-        return make(**arguments)
-    except _Misnamed:
-        raise
+        complaint = _complaint(make, arguments, place)
+        if not complaint:
+            return make(**arguments)
     except Exception as error:
         said = " ".join(str(error).split())
         is_named = said.partition(" ")[0] in arguments  # by convention, errors begin with the argument's name
         raise ValueError(_joined(place, said) if is_named else f"{place or make.__name__}: {said}") from error
+    raise ValueError(complaint)
 
 
-class _Misnamed(ValueError):
-    """An argument that there is not, or that is missing."""
-
-
-def _check_arguments(
-    make: Any, parameters: Mapping[str, inspect.Parameter], given: Mapping[str, Any], place: str
-) -> None:
+def _complaint(make: Any, given: Mapping[str, Any], place: str) -> str:
+    """What to say of an argument that there is not, or that is missing; nothing if all are well named."""
+    parameters = inspect.signature(make).parameters
     named = [name for name, parameter in parameters.items() if parameter.kind in NAMED]
     takes_any = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values())
     for name in given:
         if name not in named and not takes_any:
-            raise _Misnamed(f"{_joined(place, name)} is none of {make.__name__}'s arguments: {', '.join(named)}")
+            return f"{_joined(place, name)} is none of {make.__name__}'s arguments: {', '.join(named)}"
     for name in named:
         if name not in given and parameters[name].default is inspect.Parameter.empty:
-            raise _Misnamed(f"{_joined(place, name)} is missing: {make.__name__} needs it")
+            return f"{_joined(place, name)} is missing: {make.__name__} needs it"
+    return ""
 
 
 def _plain_yaml(path: Path) -> Any:
