@@ -129,7 +129,8 @@ class Trainer:
         run = self.begin(renderer, frames, seed=seed)
         if begun is not None:
             take_over(run, begun)
-        run.callbacks, run.folder, run.resume = self.callbacks, None if folder is None else Path(folder), resume
+        run.callbacks, run.resume = self.callbacks, resume
+        run.folder = None if folder is None else Path(folder)
         for callback in self.callbacks.values():
             callback.on_train_begin(run)
         catching = nullcontext(StopRequest()) if folder is None else stop_requests()
