@@ -20,8 +20,6 @@ BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
 class ProgressBar(Callback):
     """A progress bar on standard error."""
 
-    _bar: tqdm | None = None
-
     def on_train_begin(self, run: Run) -> None:
         """Draw it."""
         self._bar = tqdm(total=100, dynamic_ncols=True, bar_format=BAR)
@@ -29,7 +27,7 @@ class ProgressBar(Callback):
     def on_step_end(self, run: Run) -> None:
         """Bring it up to date at every record."""
         record = run.record
-        if record is None or self._bar is None:
+        if record is None:
             return
         left = f"{record.seconds * (1 - run.progress) / run.progress:.0f} s" if run.progress else "unknown"
         self._bar.n = round(100 * run.progress, 1)
@@ -40,8 +38,7 @@ class ProgressBar(Callback):
 
     def on_train_end(self, run: Run) -> None:
         """Leave it as it is."""
-        if self._bar is not None:
-            self._bar.close()
+        self._bar.close()
 
 
 class BoxWarning(Callback):

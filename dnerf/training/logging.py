@@ -22,8 +22,6 @@ class JsonLinesLog(Callback):
     wrote after its last checkpoint. No line is left half written.
     """
 
-    _is_trimmed = False
-
     def __init__(self, name: str = "log.jsonl") -> None:
         self.name = name
 
