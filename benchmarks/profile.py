@@ -15,8 +15,7 @@ from benchmarks.suite import BarPlot, Settings, SuiteResult, Table
 from benchmarks.timing import Timing, summarize
 from dnerf.fields.base import RadianceField
 from dnerf.rendering.renderer import Renderer
-from dnerf.training.callbacks import Callback
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 
 UPDATE = "occupancy update"
 BETWEEN = "Python and dispatch between operations"

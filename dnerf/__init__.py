@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from dnerf.samplers.base import Sampler
     from dnerf.samplers.occupancy import OccupancySampler
     from dnerf.scenes import make_scene
-    from dnerf.training.callbacks import Callback
     from dnerf.training.presets import load_dataset, make_renderer, make_trainer
+    from dnerf.training.run import Callback
     from dnerf.training.runs import load_run
     from dnerf.training.trainer import Trainer
 
@@ -51,7 +51,7 @@ _HOMES = {
     "samplers.base": ("Sampler",),
     "samplers.occupancy": ("OccupancySampler",),
     "scenes": ("make_scene",),
-    "training.callbacks": ("Callback",),
+    "training.run": ("Callback",),
     "training.presets": ("load_dataset", "make_renderer", "make_trainer"),
     "training.runs": ("load_run",),
     "training.trainer": ("Trainer",),

@@ -18,7 +18,7 @@ from dnerf.core.geometry import box_planes
 from dnerf.data import SceneRecord
 from dnerf.data.normalization import IDENTITY
 from dnerf.deformations import Deformation
-from dnerf.deformations.jacobian import folding
+from dnerf.deformations.inversion import folding
 from dnerf.evaluation import spread_indices
 from dnerf.motion import Tracks, motion_model
 from dnerf.visualization import render_tracks, visible_points, write_frames, write_png

@@ -71,12 +71,10 @@ class FlowDeformation(InvertibleDeformation):
         Raises:
             IntegrationError: where the solver fails or positions become infinite.
         """
-        check_positions_times(positions, times)
         return self._solve(positions, times, backwards=False)
 
     def inverse(self, canonical: Tensor, times: Tensor) -> Tensor:
         """World positions (..., 3) at times (...,) of canonical positions (..., 3); raises as `forward`."""
-        check_positions_times(canonical, times)
         if not self.corrections or not canonical.numel():
             return self.reverse(canonical, times)
 
@@ -95,10 +93,10 @@ class FlowDeformation(InvertibleDeformation):
 
     def reverse(self, canonical: Tensor, times: Tensor) -> Tensor:
         """The equation solved backwards in the same steps: `inverse` without corrections."""
-        check_positions_times(canonical, times)
         return self._solve(canonical, times, backwards=True)
 
     def _solve(self, positions: Tensor, times: Tensor, *, backwards: bool) -> Tensor:
+        check_positions_times(positions, times)
         if not positions.numel():
             return positions
         start, end, spans = self._spans(times, backwards)

@@ -74,12 +74,6 @@ class Solver:
         tolerances = {"rtol": self.rtol, "atol": self.atol}
         return odeint(right_hand_side, positions, interval, method=self.name, options=options, **tolerances)[-1]
 
-    def advice(self) -> str:
-        """What to change when an integration fails."""
-        if self.is_adaptive:
-            return "raise rtol and atol, take a fixed-step solver (rk4), or keep the velocity small and smooth"
-        return "take more steps, lower the learning rate, or keep the velocity small and smooth"
-
 
 def fixed_steps(name: str, right_hand_side: RightHandSide, positions: Tensor, num_steps: int) -> Tensor:
     """Positions at s = 1 by equal steps of an explicit Runge-Kutta rule of order 1, 2 or 4 (the 3/8 rule)."""
@@ -128,9 +122,12 @@ def failure(
     speeds = (slope + 0 * x).reshape(-1, 3).norm(dim=-1)
     # The first point that is not finite, or the fastest.
     index = int(torch.where(torch.isfinite(speeds), speeds, torch.inf).argmax())
+    remedy = "raise rtol and atol, take a fixed-step solver (rk4)"
+    if not solver.is_adaptive:
+        remedy = "take more steps, lower the learning rate"
     begin, finish = float(start.reshape(-1)[index]), float(end.reshape(-1)[index])
     return IntegrationError(
         f"flow: {reason} at time {begin + float(s) * (finish - begin):.4g} (point {index} of {len(speeds)}, on its way "
         f"from time {begin:.4g} to {finish:.4g} at {float(speeds[index]):.3g} world units per way) with {solver.name}; "
-        f"{solver.advice()}"
+        f"{remedy}, or keep the velocity small and smooth"
     )

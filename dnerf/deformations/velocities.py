@@ -57,8 +57,12 @@ class BoxWindow(nn.Module):
 
     def forward(self, positions: Tensor) -> Tensor:
         """Factor (..., 1) at positions (..., 3)."""
+        dtype = positions.dtype
+        # From the faces, in units of the fading layer.
+        depth = ((self.reach.to(dtype) - (positions - self.center.to(dtype)).abs()) * self.slope.to(dtype)).clamp(0, 1)
+        steps = depth ** len(self.coefficients) * _polynomial(depth, self.coefficients)
         # Not `prod`, whose backward pass asks the device for zeros.
-        x, y, z = self._steps(self._depth(positions)).split(1, dim=-1)
+        x, y, z = steps.split(1, dim=-1)
         return x * y * z
 
     def inside(self, positions: Tensor) -> Tensor:
@@ -66,14 +70,6 @@ class BoxWindow(nn.Module):
         product overflows for points however far."""
         center, reach = self.center.to(positions.dtype), self.reach.to(positions.dtype)
         return positions.clamp(center - reach, center + reach)
-
-    def _depth(self, positions: Tensor) -> Tensor:
-        """Distance from the faces in units of the fading layer, clamped to [0, 1]; (..., 3)."""
-        dtype = positions.dtype
-        return ((self.reach.to(dtype) - (positions - self.center.to(dtype)).abs()) * self.slope.to(dtype)).clamp(0, 1)
-
-    def _steps(self, depth: Tensor) -> Tensor:
-        return depth ** (len(self.coefficients)) * _horner(depth, self.coefficients)
 
 
 def smooth_step_coefficients(smoothness: int) -> list[float]:
@@ -85,7 +81,7 @@ def smooth_step_coefficients(smoothness: int) -> list[float]:
     return [(-1.0) ** k * math.comb(n + k, k) * math.comb(2 * n + 1, n - k) for k in range(n + 1)]
 
 
-def _horner(x: Tensor, coefficients: Sequence[float]) -> Tensor:
+def _polynomial(x: Tensor, coefficients: Sequence[float]) -> Tensor:
     value = torch.full_like(x, coefficients[-1])
     for c in reversed(coefficients[:-1]):
         value = value * x + c

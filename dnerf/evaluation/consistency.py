@@ -64,9 +64,7 @@ def check_consistency(
         slabs: of equal length that the sampler divides time into.
         truth: the exact images, if they are known.
     """
-    was_training = renderer.training
-    renderer.eval()
-    try:
+    with renderer.evaluating():
         # The field alone: what a sampler leaves out may change from slab to slab, which the second check looks at.
         sampler = StratifiedSampler(NUM_SAMPLES, None if box is None else as_box(box))
         plain = Renderer(renderer.field, sampler, renderer.background).eval()
@@ -80,8 +78,6 @@ def check_consistency(
             findings.append(check_closing(renderer, rays, truth))
             if len(train_times) > 1:
                 findings.append(check_unseen_times(renderer, truth, rays, train_times))
-    finally:
-        renderer.train(was_training)
     return findings
 
 

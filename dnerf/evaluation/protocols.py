@@ -66,12 +66,12 @@ def scene_means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     eight- and seven-scene means are given only when all their scenes are; any other set of at least two is named, for
     example "mean of 2 (lego: val, mutant)". A mean also says what its rows have in common (`SHARED`).
     """
+    apart: dict[tuple[Any, ...], dict[str, list[Mapping[str, Any]]]] = {}
+    for row in rows:
+        key = tuple(row.get(name) for name in APART)
+        apart.setdefault(key, {}).setdefault(row["scene"], []).append(row)
     means = []
-    for key in dict.fromkeys(tuple(row.get(name) for name in APART) for row in rows):
-        by_scene: dict[str, list[Mapping[str, Any]]] = {}
-        for row in rows:
-            if tuple(row.get(name) for name in APART) == key:
-                by_scene.setdefault(row["scene"], []).append(row)
+    for key, by_scene in apart.items():
         eight, seven = set(DNERF_SCENES), set(DNERF_SCENES) - {LEGO}
         lego = f"{LEGO}: {'/'.join(sorted({row['split'] for row in by_scene.get(LEGO, ())}))}"
         groups: list[tuple[str, list[str]]] = []

@@ -74,7 +74,7 @@ def write_report_text(
     size = sum(path.stat().st_size for path in [*films, *(path for _, _, path in sheets)])
     if size > MAX_BYTES:
         raise ValueError(f"films and images must be at most {MAX_BYTES >> 20} MiB together, got {size / 2**20:.0f}")
-    first = metrics[0]
+    first, listed = metrics[0], [{"protocol": "own", **m} for m in metrics]
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         title=title,
@@ -86,7 +86,8 @@ def write_report_text(
         curves=[_curve(m) for m in metrics if len(m["frames"]) > 1],
         temporal=None if temporal is None else _temporal(temporal),
         plan=plan,
-        table=_table([{"protocol": "own", **m} for m in metrics]),
+        # A row per measure and a column per evaluation: there are many of the one and few of the other.
+        table=[(name, [cell(m.get(key), form) for m in listed]) for key, name, form in filled_columns(listed)],
         facts=_facts(first),
         frames=_frames(first["frames"]),
         config=config,
@@ -197,11 +198,6 @@ def _temporal_cell(scores: Mapping[str, Any], key: str | None, form: str) -> str
     if key is None or key not in scores:
         return ""
     return NOT_MEASURED if scores[key] is None else format(scores[key], form)
-
-
-def _table(metrics: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
-    """A row per measure and a column per evaluation: there are many of the one and few of the other."""
-    return [(name, [cell(m.get(key), form) for m in metrics]) for key, name, form in filled_columns(metrics)]
 
 
 def _facts(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -70,8 +70,6 @@ def evaluate(
     """
     device = renderer.device
     frames = frames.to(device)
-    was_training = renderer.training
-    renderer.eval()
     background = renderer.plain_background()
     scores, seconds = [], []
     for i in spread_indices(len(frames), max_frames):
@@ -88,7 +86,6 @@ def evaluate(
         scores.append(score)
         if on_frame is not None:
             on_frame(score, prediction, truth)
-    renderer.train(was_training)
     distances = [score.lpips for score in scores if score.lpips is not None]
     means = fmean(score.psnr for score in scores), fmean(score.ssim for score in scores)
     lpips_mean = fmean(distances) if distances else None

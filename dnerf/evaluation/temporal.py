@@ -74,6 +74,14 @@ class _Film:
         """Where an image shows a surface, (H, W) bool."""
         return self.renderings[index].opacity >= OPAQUE
 
+    def steadiness(self, i: int, flow: Tensor, visible: Tensor, moved_depth: Tensor) -> dict[str, float]:
+        """What needs no true motion to be scored between image i and the next, by a motion (H, W, 2) and its depth."""
+        depth, opaque = self.renderings[i + 1].depth, self.opaque(i + 1)
+        return {
+            "warping_error": warping_error(self.images[i], self.images[i + 1], flow, visible),
+            "depth_consistency": depth_consistency(moved_depth.to(depth), depth, flow, visible, second_opaque=opaque),
+        }
+
 
 @torch.no_grad()
 def evaluate_over_time(
@@ -137,30 +145,20 @@ def _exact_image(scene: AnalyticScene, camera: Camera, time: float, background: 
 
 def _own_row(film: _Film, i: int) -> dict[str, float]:
     """Scores of a pair of frames by the model's own motion; NaN where nothing is visible in both."""
-    vectors, images = film.vectors[i], film.images[i : i + 2]
+    vectors = film.vectors[i]
     found = vectors.visible & vectors.found
     moved = (vectors.positions + vectors.flow_3d - film.camera.pose[:3, 3]).norm(dim=-1)
-    return {
-        "warping_error": warping_error(images[0], images[1], vectors.flow_2d, found),
-        "depth_consistency": depth_consistency(
-            moved, film.renderings[i + 1].depth, vectors.flow_2d, found, second_opaque=film.opaque(i + 1)
-        ),
-        "found": float(found.sum() / vectors.visible.sum()),
-    }
+    found_share = float(found.sum() / vectors.visible.sum())
+    return {**film.steadiness(i, vectors.flow_2d, found, moved), "found": found_share}
 
 
 def _exact_row(film: _Film, i: int, flow: ExactFlow) -> dict[str, float]:
     """Scores of a pair of frames by the scene's motion; NaN where the film shows nothing of it."""
-    vectors, images = film.vectors[i], film.images[i : i + 2]
-    exact, depth = flow.vectors.to(images), film.renderings[i + 1].depth
-    visible = flow.visible & film.opaque(i)
+    vectors, exact = film.vectors[i], flow.vectors.to(film.images)
     both = vectors.visible & vectors.found & (flow.owners >= 0)
     followed = both & flow.visible
     return {
-        "warping_error": warping_error(images[0], images[1], exact, visible),
-        "depth_consistency": depth_consistency(
-            flow.moved_depth.to(depth), depth, exact, visible, second_opaque=film.opaque(i + 1)
-        ),
+        **film.steadiness(i, exact, flow.visible & film.opaque(i), flow.moved_depth),
         "flow_error": end_point_error(vectors.flow_2d, exact, followed),
         "still_flow_error": end_point_error(torch.zeros_like(exact), exact, followed),
         "flow_outliers": flow_outliers(vectors.flow_2d, exact, followed),

@@ -4,8 +4,7 @@ from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import AppearanceConstancyLoss, ElasticLoss, JacobianDeterminantLoss, RestLoss, VolumeLoss
 from dnerf.losses.histogram import HistogramLoss
 from dnerf.losses.photometric import PhotometricLoss
-from dnerf.losses.regularizers import SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
-from dnerf.losses.surfaces import EikonalLoss
+from dnerf.losses.regularizers import EikonalLoss, SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 
 __all__ = [
     "AppearanceConstancyLoss", "Batch", "EikonalLoss", "ElasticLoss", "HistogramLoss", "JacobianDeterminantLoss",

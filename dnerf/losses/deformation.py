@@ -15,7 +15,7 @@ from torch import Tensor
 from dnerf.core.checks import check_positive
 from dnerf.core.compositing import Rendering
 from dnerf.core.schedules import Schedule
-from dnerf.deformations import Deformation, unwrapped
+from dnerf.deformations import unwrapped
 from dnerf.fields import DeformedField
 from dnerf.losses.base import Batch, Loss
 from dnerf.rendering.renderer import Renderer
@@ -50,15 +50,20 @@ class DeformationLoss(Loss):
         weight: factor of the term.
         num_points: at most so many samples of each batch are looked at, evenly spread over it.
         every: steps between its turns, see `Loss`.
+        saturation: price, before `weight`, that no point exceeds, see `saturated`; None for none.
 
     Raises:
-        ValueError: for a negative weight or no points.
+        ValueError: for a negative weight, no points, or a saturation that is not positive.
     """
 
-    def __init__(self, weight: float | Schedule, num_points: int = 1024, *, every: int = 1) -> None:
+    def __init__(
+        self, weight: float | Schedule, num_points: int, *, every: int, saturation: float | None = None
+    ) -> None:
         super().__init__(weight, every=every)
         check_positive("num_points", num_points)
-        self.num_points = num_points
+        if saturation is not None:
+            check_positive("saturation", saturation)
+        self.num_points, self.saturation = num_points, saturation
 
     def check(self, model: Renderer) -> None:
         """Needs a deformed field."""
@@ -67,7 +72,7 @@ class DeformationLoss(Loss):
     def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
         """The mean of what is wrong at points of the batch."""
         points = self._points(rendering)
-        return (points.shares * self._penalty(deformed(model, self), points)).sum()
+        return (points.shares * saturated(self._penalty(deformed(model, self), points), self.saturation)).sum()
 
     @abstractmethod
     def _penalty(self, field: DeformedField, points: MotionPoints) -> Tensor:
@@ -99,32 +104,28 @@ class ElasticLoss(DeformationLoss):
     Jacobian.
 
     Args:
-        weight, num_points, every: see `DeformationLoss`.
+        weight, num_points, every, saturation: see `DeformationLoss`.
         distance: of the differences, h, in world units.
-        saturation: price, before `weight`, that no point exceeds, see `saturated`; None for none.
 
     Raises:
-        ValueError: as `DeformationLoss`, and for a distance or a saturation that is not positive.
+        ValueError: as `DeformationLoss`, and for a distance that is not positive.
     """
 
     def __init__(
         self, weight: float | Schedule = 1e-3, num_points: int = 512, *, distance: float = 0.02,
         saturation: float | None = None, every: int = 2,
     ) -> None:  # fmt: skip
-        super().__init__(weight, num_points, every=every)
+        super().__init__(weight, num_points, every=every, saturation=saturation)
         check_positive("distance", distance)
-        if saturation is not None:
-            check_positive("saturation", saturation)
         self.distance = distance
-        self.saturation = saturation
 
     def _penalty(self, field: DeformedField, points: MotionPoints) -> Tensor:
-        """Squared logarithm of the stretch, saturated; of a collapsed direction as of a hundredth of its length."""
+        """Squared logarithm of the stretch; of a collapsed direction as of a hundredth of its length."""
         steps = self.distance * spread_directions(points.positions)
         ends = torch.cat([points.positions, points.positions + steps])
         here, there = unwrapped(field.deformation)(ends, points.times.repeat(2)).chunk(2)
         squared = ((there - here) / self.distance).square().sum(-1)
-        return saturated((0.5 * torch.log(squared + LEAST_STRETCH**2)).square(), self.saturation)
+        return (0.5 * torch.log(squared + LEAST_STRETCH**2)).square()
 
 
 class RestLoss(DeformationLoss):
@@ -161,37 +162,31 @@ class VolumeLoss(DeformationLoss):
     deviation: its square, and the straight end.
 
     Args:
-        weight, num_points, every: see `DeformationLoss`.
+        weight, num_points, every, saturation: see `DeformationLoss`.
         distance: of the forward differences, in world units.
         least: determinant below which the logarithm goes on as its tangent.
-        saturation: price, before `weight`, that no point exceeds, see `saturated`; None for none.
 
     Raises:
-        ValueError: as `DeformationLoss`, and for a distance, a least determinant or a saturation that is not positive.
+        ValueError: as `DeformationLoss`, and for a distance or a least determinant that is not positive.
     """
 
     def __init__(
         self, weight: float | Schedule = 3e-3, num_points: int = 256, *, distance: float = 0.02, least: float = 0.1,
         saturation: float | None = None, every: int = 4,
     ) -> None:  # fmt: skip
-        super().__init__(weight, num_points, every=every)
+        super().__init__(weight, num_points, every=every, saturation=saturation)
         check_positive("distance", distance)
         check_positive("least", least)
-        if saturation is not None:
-            check_positive("saturation", saturation)
-        self.distance = distance
-        self.least = least
-        self.saturation = saturation
+        self.distance, self.least = distance, least
 
     def _penalty(self, field: DeformedField, points: MotionPoints) -> Tensor:
-        """Squared logarithm of the determinant, saturated."""
-        return saturated(self.logarithms(unwrapped(field.deformation), points).square(), self.saturation)
+        return self.logarithms(field, points).square()
 
-    def logarithms(self, deformation: Deformation, points: MotionPoints) -> Tensor:
+    def logarithms(self, field: DeformedField, points: MotionPoints) -> Tensor:
         """Logarithm of the determinant (M,), of finite differences along the three axes; below `least` its tangent."""
         steps = self.distance * torch.eye(3, dtype=points.positions.dtype, device=points.positions.device)
         places = points.positions + torch.cat([torch.zeros_like(steps[:1]), steps])[:, None]
-        here, *there = deformation(places, points.times.expand(places.shape[:-1])).unbind()
+        here, *there = unwrapped(field.deformation)(places, points.times.expand(places.shape[:-1])).unbind()
         x, y, z = ((end - here) / self.distance for end in there)
         determinant = (torch.linalg.cross(x, y) * z).sum(-1)
         return torch.log(determinant.clamp(min=self.least)) + (determinant / self.least - 1).clamp(max=0)
@@ -227,7 +222,7 @@ class JacobianDeterminantLoss(VolumeLoss):
 
     def _penalty(self, field: DeformedField, points: MotionPoints) -> Tensor:
         """Squared logarithm of the determinant to the limit, where it is smaller."""
-        return (self.logarithms(unwrapped(field.deformation), points) - math.log(self.limit)).clamp(max=0).square()
+        return (self.logarithms(field, points) - math.log(self.limit)).clamp(max=0).square()
 
 
 class AppearanceConstancyLoss(DeformationLoss):

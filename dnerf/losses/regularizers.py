@@ -1,26 +1,46 @@
-"""Terms about the field rather than the image: unseen space, roughness of volumes and of time embeddings."""
+"""Terms about the field rather than the image: unseen space, surfaces, roughness of volumes and time embeddings."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import as_box, check_positive
+from dnerf.core.checks import as_box, check_positive, check_whole
 from dnerf.core.compositing import Rendering
 from dnerf.core.schedules import Schedule
 from dnerf.deformations import unwrapped
-from dnerf.fields.base import HasRoughness
+from dnerf.fields.base import HasRoughness, RadianceField, SignedDistance, surface_of
+from dnerf.fields.normals import differences
 from dnerf.losses.base import Batch, Loss
-from dnerf.losses.deformation import deformed
+from dnerf.losses.deformation import deformed, spread_numbers
 from dnerf.nn.encodings import TimeEncoding
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import OccupancyAware
 
 VISIBLE_WEIGHT = 1e-3  # share in an image from which a sample counts as seen
-PLASTIC = 1.1347241384015194
+# By dimension d, the root of x^(d + 1) = x + 1, whose powers make Kronecker's sequence (Roberts 2018).
+ROOTS = {3: 1.2207440846057596, 5: 1.1347241384015194}
 
 
-class UnseenSpaceLoss(Loss):
+class PlacesLoss(Loss):
+    """A term at places that are spread evenly over many steps, others at every call."""
+
+    def __init__(self, weight: float | Schedule, num_points: int, *, dimensions: int, every: int) -> None:
+        super().__init__(weight, every=every)
+        self.num_points = num_points
+        self.num_calls = nn.Buffer(torch.zeros((), dtype=torch.int64))
+        powers = torch.arange(1, dimensions + 1, dtype=torch.float64)
+        self.generators = nn.Buffer(ROOTS[dimensions] ** -powers, persistent=False)
+
+    def next_places(self, like: Tensor) -> Tensor:
+        """Points (num_points, dimensions) of the unit cube, with another tensor's device and dtype."""
+        self.to(like.device)
+        self.num_calls.add_(1)
+        number = self.num_calls * self.num_points + torch.arange(self.num_points, device=like.device)
+        return (number[:, None] * self.generators % 1).to(like.dtype)
+
+
+class UnseenSpaceLoss(PlacesLoss):
     """Opacity in canonical space that no ray sees, at random places in occupied cells.
 
     A field invents floaters where no training ray reaches (below the ground, inside bodies), and views from elsewhere
@@ -49,23 +69,18 @@ class UnseenSpaceLoss(Loss):
         self, box: Sequence[Sequence[float]] | None = None, weight: float | Schedule = 1e-2, num_points: int = 1024, *,
         every: int = 4, length: float = 0.02, resolution: int = 64, memory_samples: int = 1 << 20,
     ) -> None:  # fmt: skip
-        super().__init__(weight, every=every)
+        super().__init__(weight, num_points, dimensions=5, every=every)
         for name, value in (
             ("num_points", num_points), ("length", length), ("resolution", resolution),
             ("memory_samples", memory_samples),
         ):  # fmt: skip
             check_positive(name, value)
-        self.num_points = num_points
         self.length = length
         self.memory_samples = memory_samples
         self.takes_box = box is None
         self.box = nn.Buffer(torch.zeros(2, 3) if box is None else as_box(box), persistent=False)
-        self.num_calls = nn.Buffer(torch.zeros((), dtype=torch.int64))
         self.num_samples = nn.Buffer(torch.zeros((), dtype=torch.int64))
         self.last_seen = nn.Buffer(torch.full((resolution,) * 3, -memory_samples - 1, dtype=torch.int64))
-        # Kronecker's sequence in five dimensions: powers of the root of x^6 = x + 1 (Roberts 2018).
-        powers = torch.arange(1, 6, dtype=torch.float64)
-        self.generators = nn.Buffer(PLASTIC**-powers, persistent=False)
 
     def check(self, model: Renderer) -> None:
         """Needs a deformed field, and a sampler that knows which cells are occupied, whose box it may take."""
@@ -81,15 +96,12 @@ class UnseenSpaceLoss(Loss):
         assert isinstance(sampler, OccupancyAware)
         assert rendering.output is not None
         assert rendering.weights is not None
-        self.to(rendering.rgb.device)
-        self.num_calls.add_(1)
+        unit = self.next_places(rendering.rgb)
         self.num_samples.add_(rendering.weights.numel())
         # Nothing here waits for a device: which samples are seen, and how many, is known there only.
         seen = torch.where(rendering.weights > VISIBLE_WEIGHT, self.num_samples, torch.iinfo(torch.int64).min)
         cells = self._cells(rendering.output.extras["canonical_positions"].detach())
         self.last_seen.view(-1).scatter_reduce_(0, cells.reshape(-1), seen.reshape(-1), "amax")
-        number = self.num_calls * self.num_points + torch.arange(self.num_points, device=seen.device)
-        unit = (number[:, None] * self.generators % 1).to(rendering.rgb.dtype)
         places = sampler.occupied_positions(unit.clamp(max=1 - torch.finfo(unit.dtype).eps))
         with torch.no_grad(), model.autocast(seen.device):
             canonical = unwrapped(field.deformation)(*places)  # these points lie on no rays
@@ -191,3 +203,57 @@ class TimeEmbeddingLoss(Loss):
         if self.rays_per_embedding is None:
             return 1.0
         return (self.num_rays / (self.rays_per_embedding * encoding.num_used)).clamp(min=1)
+
+
+def canonical_surface(field: RadianceField) -> SignedDistance | None:
+    """What has a surface in canonical space, behind all deformations; None if nothing has."""
+    surfaces = [part for part in field.modules() if isinstance(part, RadianceField) and surface_of(part)]
+    return surface_of(surfaces[-1]) if surfaces else None  # parts come after what they are part of
+
+
+class EikonalLoss(PlacesLoss):
+    """The gradient of a signed distance has length one: the mean of `(|grad d| - 1)^2`, in canonical space.
+
+    At some of a batch's own samples, and at as many places spread over a box. The gradient is that of central
+    differences over a cell of the finest open level of the grid: they reach into neighbouring cells, so that surfaces
+    become smooth, and need no second derivatives.
+
+    Source: IGR (arXiv 2002.10099) eq. 2; differences that follow the levels from Neuralangelo (arXiv 2306.03092)
+    section 3.2.
+
+    Args:
+        box: (2, 3) corners of the space in which places lie, in world units.
+        weight, every: see `Loss`.
+        num_points: samples of each batch, and as many places in the box.
+
+    Raises:
+        ValueError: for a box that is none, a negative weight, or no points.
+    """
+
+    def __init__(
+        self, box: Sequence[Sequence[float]], weight: float | Schedule = 1e-2, num_points: int = 256, *, every: int = 1
+    ) -> None:
+        super().__init__(weight, num_points, dimensions=3, every=every)
+        check_whole("num_points", num_points)
+        self.box = nn.Buffer(as_box(box), persistent=False)
+
+    def check(self, model: Renderer) -> None:
+        """Needs a field with a signed distance."""
+        if canonical_surface(model.field) is None:
+            raise ValueError(f"EikonalLoss needs a field with a signed distance, got {type(model.field).__name__}")
+
+    def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
+        """Mean squared deviation from one; other places at every call."""
+        surface = canonical_surface(model.field)
+        assert surface is not None
+        assert rendering.output is not None
+        unit = self.next_places(rendering.rgb)
+        places = [torch.lerp(self.box[0].to(unit.dtype), self.box[1].to(unit.dtype), unit)]
+        times = [unit[:, 0] * 0]
+        extras = rendering.output.extras
+        if "canonical_positions" in extras:
+            chosen = spread_numbers(extras["times"].shape, self.num_points, unit.device)
+            places.append(extras["canonical_positions"].detach().reshape(-1, 3)[chosen])
+            times.append(extras["times"].reshape(-1)[chosen])
+        gradients = differences(surface, torch.cat(places), torch.cat(times), surface.detail)
+        return (gradients.norm(dim=-1) - 1).square().mean()

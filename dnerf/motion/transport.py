@@ -106,13 +106,11 @@ def follow(model: MotionModel, positions: Tensor, time: float, times: Tensor) ->
     check_shape("times", times, ("T",))
     values = times.tolist()
     found: dict[int, tuple[Tensor, Tensor]] = {}
-    forwards = sorted((i for i, t in enumerate(values) if t >= time), key=lambda i: values[i])
-    backwards = sorted((i for i, t in enumerate(values) if t < time), key=lambda i: -values[i])
-    for order in (forwards, backwards):
-        guess = positions
-        for i in order:
-            found[i] = carry(model, positions, time, values[i], guess=guess)
-            guess = found[i][0]
+    guesses = {True: positions, False: positions}  # later, and earlier
+    for i in sorted(range(len(values)), key=lambda i: abs(values[i] - time)):
+        is_later = values[i] >= time
+        found[i] = carry(model, positions, time, values[i], guess=guesses[is_later])
+        guesses[is_later] = found[i][0]
     if not found:
         return Tracks(times, positions[None][:0], positions[None][:0, ..., 0])
     return Tracks(times, *(torch.stack([found[i][k] for i in range(len(values))]) for k in (0, 1)))

@@ -70,11 +70,11 @@ def motion_vectors(
             moved[some], residual[some] = carry(model, positions[some], time, other_time)
     pixels, other_z = other_camera.project(moved)
     valid = other_z > 0
-    visible = valid & _inside(pixels, other_camera)
+    visible = valid & inside_image(pixels, other_camera)
     if other_depth is not None:
         check_shape("other_depth", other_depth, (other_camera.intrinsics.height, other_camera.intrinsics.width))
         distance = (moved - other_camera.pose[:3, 3]).norm(dim=-1)
-        visible &= distance <= _nearest(other_depth, pixels) + TOLERANCE
+        visible &= distance <= nearest_value(other_depth, pixels) + TOLERANCE
     flow_2d = torch.where(valid[:, None], pixels - camera.project(positions)[0], torch.nan)
     flow_3d = torch.where(valid[:, None], moved - positions, torch.nan)
     residual = torch.where(valid, residual, torch.nan)
@@ -102,13 +102,13 @@ def hiding_depth(depth: Tensor, opacity: Tensor) -> Tensor:
     return torch.where(opacity < OPAQUE, torch.inf, depth)
 
 
-def _inside(pixels: Tensor, camera: Camera) -> Tensor:
+def inside_image(pixels: Tensor, camera: Camera) -> Tensor:
     """Whether points (N, 2) round to a pixel of the image; NaN does not."""
     limits = torch.tensor([camera.intrinsics.width, camera.intrinsics.height], device=pixels.device)
     return ((pixels >= -0.5) & (pixels < limits - 0.5)).all(-1)
 
 
-def _nearest(image: Tensor, pixels: Tensor) -> Tensor:
+def nearest_value(image: Tensor, pixels: Tensor) -> Tensor:
     """Value (N,) of the pixel nearest to each of (N, 2), those outside clamped to the edge."""
     pixels = pixels.nan_to_num(nan=0.0)
     columns = pixels[:, 0].round().clamp(0, image.shape[1] - 1).long()

@@ -1,5 +1,7 @@
 """The renderer: rays -> sampler -> field -> composite. It is the whole trainable model."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
 
@@ -161,6 +163,17 @@ class Renderer(nn.Module):
         self.generation += 1
         self._frames = None
 
+    @contextmanager
+    def evaluating(self) -> Iterator[None]:
+        """Evaluation mode while the block lasts; every part has its own mode after it."""
+        modes = [(module, module.training) for module in self.modules()]
+        self.eval()
+        try:
+            yield
+        finally:
+            for module, mode in modes:
+                module.training = mode
+
     @torch.no_grad()
     def render_image(self, camera: Camera, time: float, *, chunk: int = 16384) -> Rendering:
         """Render a whole image in evaluation mode, without gradients.
@@ -183,13 +196,8 @@ class Renderer(nn.Module):
         dtype = next((p.dtype for p in self.parameters() if p.is_floating_point()), camera.pose.dtype)
         if camera.pose.dtype != dtype:
             camera = replace(camera, pose=camera.pose.to(dtype))
-        modes = [(module, module.training) for module in self.modules()]
-        self.eval()
-        try:
+        with self.evaluating():
             columns = image_columns(self, camera, time, chunk, self._graph_frames())
-        finally:
-            for module, mode in modes:
-                module.training = mode
         columns = columns.reshape(camera.intrinsics.height, camera.intrinsics.width, 5)
         return Rendering(rgb=columns[..., :3], opacity=columns[..., 3], depth=columns[..., 4])
 

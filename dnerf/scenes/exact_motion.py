@@ -21,17 +21,11 @@ HIDDEN_BY = 1e-6
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points on the first surfaces that R rays meet.
+    """Points on the first surfaces that R rays meet."""
 
-    Args:
-        positions: (R, 3) in world units; NaN where a ray meets nothing.
-        owners: (R,) int64, index of the body, -1 where a ray meets nothing.
-        distances: (R,) along the ray, infinite where it meets nothing.
-    """
-
-    positions: Tensor
-    owners: Tensor
-    distances: Tensor
+    positions: Tensor  # (R, 3) in world units; NaN where a ray meets nothing
+    owners: Tensor  # (R,) int64, index of the body, -1 where a ray meets nothing
+    distances: Tensor  # (R,) along the ray, infinite where it meets nothing
 
 
 def first_surfaces(scene: AnalyticScene, rays: Rays) -> SurfacePoints:
@@ -71,22 +65,16 @@ def is_visible(scene: AnalyticScene, camera: Camera, time: float, positions: Ten
 class ExactFlow:
     """Motion between two images of a scene.
 
-    Args:
-        vectors: (H, W, 2) pixels to the right and down from each pixel of the first image to where the same point is
-            in the second, camera motion included; NaN where a pixel shows no body.
-        visible: (H, W) bool, whether that point is visible in the second image too.
-        positions: (H, W, 3) of the point at the first time, in world units; NaN without one.
-        moved: (H, W, 3) of the same point at the second time.
-        moved_depth: (H, W) distance of the moved point from the second eye.
-        owners: (H, W) index of the body, -1 without one.
+    Vectors are pixels to the right and down from each pixel of the first image to where the same point is in the
+    second, camera motion included.
     """
 
-    vectors: Tensor
-    visible: Tensor
-    positions: Tensor
-    moved: Tensor
-    moved_depth: Tensor
-    owners: Tensor
+    vectors: Tensor  # (H, W, 2); NaN where a pixel shows no body
+    visible: Tensor  # (H, W) bool, whether that point is visible in the second image too
+    positions: Tensor  # (H, W, 3) of the point at the first time, in world units; NaN without one
+    moved: Tensor  # (H, W, 3) of the same point at the second time
+    moved_depth: Tensor  # (H, W) distance of the moved point from the second eye
+    owners: Tensor  # (H, W) index of the body, -1 without one
 
 
 def exact_flow(scene: AnalyticScene, first: Camera, t0: float, second: Camera, t1: float) -> ExactFlow:
@@ -114,17 +102,11 @@ def exact_flow(scene: AnalyticScene, first: Camera, t0: float, second: Camera, t
 
 @dataclass(frozen=True)
 class ExactTracks:
-    """N points of surfaces through T times.
+    """N points of surfaces through T times."""
 
-    Args:
-        positions: (T, N, 3) in world units.
-        pixels: (T, N, 2) column and row in the camera of each time.
-        visible: (T, N) bool.
-    """
-
-    positions: Tensor
-    pixels: Tensor
-    visible: Tensor
+    positions: Tensor  # (T, N, 3) in world units
+    pixels: Tensor  # (T, N, 2) column and row in the camera of each time
+    visible: Tensor  # (T, N) bool
 
 
 def exact_tracks(

@@ -35,22 +35,15 @@ def turn(axis: Vector, angles: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Pose:
-    """World point = scale * rotation @ local point + translation.
-
-    Args:
-        rotation: (..., 3, 3).
-        translation: (..., 3) in world units.
-        scale: (...,) > 0.
-        presence: (...,) 1 while the body is there, 0 while it is not.
-    """
+    """World point = scale * rotation @ local point + translation."""
 
     num_pieces: ClassVar[int] = 1
     """Equal parts of a body along a ray in each of which its colour is smooth enough for one Gauss rule."""
 
-    rotation: Tensor
-    translation: Tensor
-    scale: Tensor
-    presence: Tensor
+    rotation: Tensor  # (..., 3, 3)
+    translation: Tensor  # (..., 3) in world units
+    scale: Tensor  # (...,) > 0
+    presence: Tensor  # (...,) 1 while the body is there, 0 while it is not
 
     @classmethod
     def at(cls, times: Tensor, **parts: Any) -> Self:

@@ -26,17 +26,12 @@ RESOLUTION = 2.0**-LAST_LEVEL
 
 @dataclass(frozen=True, kw_only=True)
 class WarpedPose(Pose):
-    """A pose after a warp of the body's own space: world point = pose(warp(local point)).
-
-    Args:
-        warp: the motion that says how space is warped.
-        amount: (...,) how much, in the warp's unit.
-    """
+    """A pose after a warp of the body's own space: world point = pose(warp(local point))."""
 
     num_pieces: ClassVar[int] = 12
 
-    warp: "Warp"
-    amount: Tensor
+    warp: "Warp"  # the motion that says how space is warped
+    amount: Tensor  # (...,) how much, in the warp's unit
 
     def to_world(self, points: Tensor) -> Tensor:
         return super().to_world(self.warp.bend(points, self.amount))

@@ -1,13 +1,13 @@
 """Training a renderer on frames."""
 
 from dnerf.training.averaging import WeightAverage
-from dnerf.training.callbacks import BoxWarning, Callback, ProgressBar
+from dnerf.training.callbacks import BoxWarning, ProgressBar
 from dnerf.training.checkpoint_folder import CheckpointFolder, Checkpoints
 from dnerf.training.logging import JsonLinesLog, Previews
 from dnerf.training.optimizer import AdamMuon, AdamSettings
 from dnerf.training.records import TrainingRecord
 from dnerf.training.recovery import Recovery
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 from dnerf.training.signals import TrainingStopped
 from dnerf.training.trainer import Trainer
 

@@ -4,8 +4,7 @@ import torch
 from torch import Tensor
 
 from dnerf.core.checks import check_positive, check_whole
-from dnerf.training.callbacks import Callback
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 
 
 class WeightAverage(Callback):

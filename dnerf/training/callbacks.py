@@ -1,18 +1,14 @@
-"""What acts during training: each thing a small class that a user can leave out or replace."""
+"""Callbacks that only tell: a progress bar, and a warning about the box."""
 
 import logging
-from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from dnerf.data.bounds import cut_faces
 from dnerf.data.scene_record import SCENE, SceneRecord
 from dnerf.samplers import OccupancyAware
-
-if TYPE_CHECKING:
-    from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 
 logger = logging.getLogger(__name__)
 
@@ -21,56 +17,17 @@ WIDER = 1.3  # times the box, that a warning names
 BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
 
 
-class Callback:
-    """Called by the trainer around its steps; the clock stands still meanwhile.
-
-    A callback may change the model (and then calls `run.renderer.invalidate()`), take back a record
-    (`run.take_back()`: later callbacks do not see it) or raise. They are called in the order in which they are given,
-    those that are required after all others: what is saved of a step is all that was done in it.
-
-    Attributes:
-        handles_failures: whether it looks at records that are not finite; otherwise these end the run.
-        is_required: whether a run ends if it cannot write (`OSError`); otherwise that costs its output alone.
-        resumes: whether it brings a run's state back; `fit(resume=True)` needs one that does.
-    """
-
-    handles_failures = False
-    is_required = False
-    resumes = False
-
-    def on_train_begin(self, run: "Run") -> None:
-        """Before the first step; raises ValueError for what the run lacks."""
-
-    def on_step_begin(self, run: "Run") -> None:
-        """Before a step."""
-
-    def on_step_end(self, run: "Run") -> None:
-        """After a step; `run.record` is its record, if it has one."""
-
-    def on_train_end(self, run: "Run") -> None:
-        """After the last step, the model in evaluation mode."""
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """What a continued run has to know, as tensors of fixed shapes."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take over a state that `state_dict` gave."""
-
-
 class ProgressBar(Callback):
     """A progress bar on standard error."""
 
-    _bar: tqdm | None = None
-
-    def on_train_begin(self, run: "Run") -> None:
+    def on_train_begin(self, run: Run) -> None:
         """Draw it."""
         self._bar = tqdm(total=100, dynamic_ncols=True, bar_format=BAR)
 
-    def on_step_end(self, run: "Run") -> None:
+    def on_step_end(self, run: Run) -> None:
         """Bring it up to date at every record."""
         record = run.record
-        if record is None or self._bar is None:
+        if record is None:
             return
         left = f"{record.seconds * (1 - run.progress) / run.progress:.0f} s" if run.progress else "unknown"
         self._bar.n = round(100 * run.progress, 1)
@@ -79,10 +36,9 @@ class ProgressBar(Callback):
             f"{run.rays_done / record.seconds:,.0f} rays/s, ETA {left}"
         )
 
-    def on_train_end(self, run: "Run") -> None:
+    def on_train_end(self, run: Run) -> None:
         """Leave it as it is."""
-        if self._bar is not None:
-            self._bar.close()
+        self._bar.close()
 
 
 class BoxWarning(Callback):
@@ -91,7 +47,7 @@ class BoxWarning(Callback):
     def __init__(self, least_steps: int = 512) -> None:
         self.least_steps = least_steps
 
-    def on_train_end(self, run: "Run") -> None:
+    def on_train_end(self, run: Run) -> None:
         """Look at the outer cells that enough views see, unless the background shows what lies beyond the box.
 
         Samplers that keep no account of cells tell nothing.
@@ -107,7 +63,7 @@ class BoxWarning(Callback):
             logger.warning("geometry reaches the box at %s: what lies beyond is never sampled; %s", reached, wider)
 
 
-def _wider_box(run: "Run") -> str:
+def _wider_box(run: Run) -> str:
     """The setting that gives a box with more room, in the data set's own units, as far as the run knows them."""
     if run.folder is None or not (run.folder / SCENE).exists():
         return "see data.box"

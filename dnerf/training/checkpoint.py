@@ -49,7 +49,13 @@ def restore_run(run: Run, content: bytes, where: object, data: str) -> None:
     others = {name: value for name, value in tensors.items() if name not in moments}
     check_fit({**_fixed(run), **_random_states(run)}, others, where)
     state = _optimizer_state(moments, run, where)
-    _set_random_states(run, tensors, where)
+    for name, generator in _generators(run).items():
+        try:
+            torch.Generator(generator.device).set_state(tensors[name])
+        except RuntimeError as error:
+            raise ValueError(f"{where}: random.*: not the state of a generator ({error})") from error
+    for name, generator in _generators(run).items():
+        generator.set_state(tensors[name])
     for name, part in run.parts.items():
         start = f"{name}."
         part.load_state_dict({k.removeprefix(start): value for k, value in tensors.items() if k.startswith(start)})
@@ -70,29 +76,16 @@ def _fixed(run: Run) -> dict[str, Tensor]:
     return {f"{k}.{n}": value for k, part in run.parts.items() for n, value in part.state_dict().items()}
 
 
+def _generators(run: Run) -> dict[str, torch.Generator]:
+    """The run's generator and torch's own, which a module might draw from."""
+    found = {"random.run": run.generator, "random.cpu": torch.default_generator}
+    if run.generator.device.type == "cuda":
+        found["random.cuda"] = torch.cuda.default_generators[run.generator.device.index or 0]
+    return found
+
+
 def _random_states(run: Run) -> dict[str, Tensor]:
-    """The generator's state and those of torch's own, which a module might draw from."""
-    states = {"random.run": run.generator.get_state(), "random.cpu": torch.get_rng_state()}
-    if run.generator.device.type == "cuda":
-        states["random.cuda"] = torch.cuda.get_rng_state(run.generator.device)
-    return states
-
-
-def _set_random_states(run: Run, tensors: Mapping[str, Tensor], where: object) -> None:
-    """Set all states, or none if one is refused."""
-    before = _random_states(run)
-    try:
-        _enter_random_states(run, tensors)
-    except RuntimeError as error:
-        _enter_random_states(run, before)
-        raise ValueError(f"{where}: random.*: not the state of a generator ({error})") from error
-
-
-def _enter_random_states(run: Run, tensors: Mapping[str, Tensor]) -> None:
-    run.generator.set_state(tensors["random.run"])
-    torch.set_rng_state(tensors["random.cpu"])
-    if run.generator.device.type == "cuda":
-        torch.cuda.set_rng_state(tensors["random.cuda"], run.generator.device)
+    return {name: generator.get_state() for name, generator in _generators(run).items()}
 
 
 def _checked_facts(facts: dict[str, Any] | None, where: object, run: Run) -> dict[str, Any]:

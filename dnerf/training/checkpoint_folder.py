@@ -8,10 +8,9 @@ from pathlib import Path
 from dnerf.core.checks import check_whole
 from dnerf.core.files import write_bytes
 from dnerf.data.frames import Frames
-from dnerf.training.callbacks import Callback
 from dnerf.training.checkpoint import encode_run, max_bytes, restore_run
 from dnerf.training.records import not_finite
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 from dnerf.training.tensor_files import decode, read_limited
 
 CHECKPOINTS = "checkpoints"  # the folder's name in that of a run

@@ -48,9 +48,9 @@ def _copy(source: dict[str, Tensor], target: dict[str, Tensor], before: nn.Modul
             continue
         elif name in old_labels and name in new_labels:
             rows = {label: row for row, label in enumerate(old_labels[name])}
-            pairs = [(rows[label], row) for row, label in enumerate(new_labels[name]) if label in rows]
-            for begin, end in pairs:
-                _copy_common(old[begin], new[end])
+            for row, label in enumerate(new_labels[name]):
+                if label in rows:
+                    _copy_common(old[rows[label]], new[row])
         else:
             _copy_common(old, new)
 

@@ -11,8 +11,7 @@ from dnerf.core.files import write_text
 from dnerf.data.scene_record import SCENE, SceneRecord
 from dnerf.data.source import DataSource
 from dnerf.evaluation.scores import evaluate
-from dnerf.training.callbacks import Callback
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 from dnerf.visualization.video import comparison_sheet, write_png
 
 
@@ -22,8 +21,6 @@ class JsonLinesLog(Callback):
     The first record of a continued run replaces those of the same step and later ones, which an earlier process
     wrote after its last checkpoint. No line is left half written.
     """
-
-    _is_trimmed = False
 
     def __init__(self, name: str = "log.jsonl") -> None:
         self.name = name

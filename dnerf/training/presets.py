@@ -17,9 +17,10 @@ from dnerf.losses import AppearanceConstancyLoss, ElasticLoss, PhotometricLoss, 
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import OccupancyGrid, OccupancySampler
 from dnerf.training.averaging import WeightAverage
-from dnerf.training.callbacks import Callback, ProgressBar
+from dnerf.training.callbacks import ProgressBar
 from dnerf.training.optimizer import AdamSettings
 from dnerf.training.recovery import Recovery
+from dnerf.training.run import Callback
 from dnerf.training.trainer import Trainer
 
 Corners = Tensor | Sequence[Sequence[float]]

@@ -12,29 +12,17 @@ from dnerf.core.checks import check_positive, check_whole
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """What one step of training looked like.
+    """What one step of training looked like."""
 
-    Args:
-        step: number of steps done, this one included.
-        seconds: time spent training so far, see `Trainer`.
-        losses: each loss term of the step by name, without its weight; "loss" is what the step minimised.
-        psnr: of the batch's colours, in dB; with error-guided pixels of rays that are harder than others.
-        num_rays: rays of the batch.
-        num_samples: that its rays were rendered from, padding aside.
-        learning_rate_factor: on all learning rates, in [0, 1].
-        opacity: mean of the batch, in [0, 1].
-        contrast: mean over the batch of the largest difference between a true colour and the background, in [0, 1].
-    """
-
-    step: int
-    seconds: float
-    losses: Mapping[str, float]
-    psnr: float
-    num_rays: int
-    num_samples: int
-    learning_rate_factor: float
-    opacity: float
-    contrast: float
+    step: int  # number of steps done, this one included
+    seconds: float  # time spent training so far, see `Trainer`
+    losses: Mapping[str, float]  # terms of the step by name, without weights; "loss" is what the step minimised
+    psnr: float  # of the batch's colours, in dB; with error-guided pixels of rays that are harder than others
+    num_rays: int  # rays of the batch
+    num_samples: int  # that its rays were rendered from, padding aside
+    learning_rate_factor: float  # on all learning rates, in [0, 1]
+    opacity: float  # mean of the batch, in [0, 1]
+    contrast: float  # mean over the batch of the largest difference between a true colour and the background, in [0, 1]
 
     def broken(self) -> list[str]:
         """Names of the losses that are NaN or infinite."""

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import check_whole
-from dnerf.training.callbacks import Callback
 from dnerf.training.records import TrainingRecord, not_finite
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 
 logger = logging.getLogger(__name__)
 

@@ -1,18 +1,54 @@
-"""Where a training run stands: everything that a step changes, and what callbacks may look at."""
+"""Where a training run stands, and the callbacks that act on it: small classes that a user can leave out or replace."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dnerf.data.frames import Frames
 from dnerf.data.pixel_samplers import PixelSampler
 from dnerf.rendering.renderer import Renderer
-from dnerf.training.callbacks import Callback
 from dnerf.training.optimizer import AdamMuon
 from dnerf.training.records import TrainingRecord
+
+
+class Callback:
+    """Called by the trainer around its steps; the clock stands still meanwhile.
+
+    A callback may change the model (and then calls `run.renderer.invalidate()`), take back a record
+    (`run.take_back()`: later callbacks do not see it) or raise. They are called in the order in which they are given,
+    those that are required after all others: what is saved of a step is all that was done in it.
+
+    Attributes:
+        handles_failures: whether it looks at records that are not finite; otherwise these end the run.
+        is_required: whether a run ends if it cannot write (`OSError`); otherwise that costs its output alone.
+        resumes: whether it brings a run's state back; `fit(resume=True)` needs one that does.
+    """
+
+    handles_failures = False
+    is_required = False
+    resumes = False
+
+    def on_train_begin(self, run: "Run") -> None:
+        """Before the first step; raises ValueError for what the run lacks."""
+
+    def on_step_begin(self, run: "Run") -> None:
+        """Before a step."""
+
+    def on_step_end(self, run: "Run") -> None:
+        """After a step; `run.record` is its record, if it has one."""
+
+    def on_train_end(self, run: "Run") -> None:
+        """After the last step, the model in evaluation mode."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What a continued run has to know, as tensors of fixed shapes."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over a state that `state_dict` gave."""
 
 
 @dataclass

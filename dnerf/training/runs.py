@@ -32,17 +32,11 @@ NAMED = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A finished run.
+    """A finished run."""
 
-    Args:
-        renderer: the trained model, in evaluation mode.
-        config: what it was built and trained by, as plain values.
-        folder: where it lies.
-    """
-
-    renderer: Renderer
-    config: dict[str, Any]
-    folder: Path
+    renderer: Renderer  # the trained model, in evaluation mode
+    config: dict[str, Any]  # what it was built and trained by, as plain values
+    folder: Path  # where it lies
 
     def data(self) -> DataSource:
         """Where its frames come from; `config["data"]["root"]` may be set before, if a data set has moved.
@@ -141,8 +135,11 @@ def check_targets(node: Any, place: str = "", *, trusted: bool = False) -> None:
         ValueError: naming the place.
     """
     packages = [dnerf.__name__] if trusted else _trusted_packages()
-    for where, target in _targets(node, place):
-        where, shown = _joined(where, TARGET), repr(str(target)[:80])
+    for where, value in _nodes(node, place):
+        if not isinstance(value, Mapping) or TARGET not in value:
+            continue
+        target, where = value[TARGET], _joined(where, TARGET)
+        shown = repr(str(target)[:80])
         if not trusted and not _lies_in(str(target), packages):
             root = ascii(str(target).partition(".")[0][:40])[1:-1]
             raise ValueError(
@@ -156,15 +153,15 @@ def check_targets(node: Any, place: str = "", *, trusted: bool = False) -> None:
             raise ValueError(f"{where} must be a class, or an exact scene's maker, got {shown}")
 
 
-def _targets(node: Any, place: str) -> Iterator[tuple[str, Any]]:
+def _nodes(node: Any, place: str) -> Iterator[tuple[str, Any]]:
+    """A value of a config and all that it holds, each with its place, after what it lies in."""
+    yield place, node
     if isinstance(node, Mapping):
-        if TARGET in node:
-            yield place, node[TARGET]
         for key, value in node.items():
-            yield from _targets(value, _joined(place, key))
+            yield from _nodes(value, _joined(place, key))
     elif isinstance(node, list | tuple):
         for index, value in enumerate(node):
-            yield from _targets(value, f"{place}[{index}]")
+            yield from _nodes(value, f"{place}[{index}]")
 
 
 def _joined(place: str, key: object) -> str:
@@ -181,11 +178,7 @@ def _lies_in(name: str, packages: list[str]) -> bool:
 
 
 def _find(target: Any, place: str) -> Any:
-    """What a dotted name means.
-
-    Raises:
-        ValueError: if its module cannot be imported, or has no such thing.
-    """
+    """What a dotted name means; ValueError if its module cannot be imported, or has no such thing."""
     module_name, _, name = str(target).rpartition(".")
     try:
         return getattr(importlib.import_module(module_name), name)
@@ -204,38 +197,30 @@ def _built(node: Any, place: str) -> Any:
 
 
 def _called(make: Any, arguments: dict[str, Any], place: str) -> Any:
-    """An object, from arguments by name.
-
-    Raises:
-        ValueError: naming the place, whatever the class raises.
-    """
+    """An object, from arguments by name; ValueError, naming the place, whatever the class raises."""
     try:
-        parameters = inspect.signature(make).parameters
-        _check_arguments(make, parameters, arguments, place)
-        return make(**arguments)
-    except _Misnamed:
-        raise
+        complaint = _complaint(make, arguments, place)
+        if not complaint:
+            return make(**arguments)
     except Exception as error:
         said = " ".join(str(error).split())
         is_named = said.partition(" ")[0] in arguments  # by convention, errors begin with the argument's name
         raise ValueError(_joined(place, said) if is_named else f"{place or make.__name__}: {said}") from error
+    raise ValueError(complaint)
 
 
-class _Misnamed(ValueError):
-    """An argument that there is not, or that is missing."""
-
-
-def _check_arguments(
-    make: Any, parameters: Mapping[str, inspect.Parameter], given: Mapping[str, Any], place: str
-) -> None:
+def _complaint(make: Any, given: Mapping[str, Any], place: str) -> str:
+    """What to say of an argument that there is not, or that is missing; nothing if all are well named."""
+    parameters = inspect.signature(make).parameters
     named = [name for name, parameter in parameters.items() if parameter.kind in NAMED]
     takes_any = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values())
     for name in given:
         if name not in named and not takes_any:
-            raise _Misnamed(f"{_joined(place, name)} is none of {make.__name__}'s arguments: {', '.join(named)}")
+            return f"{_joined(place, name)} is none of {make.__name__}'s arguments: {', '.join(named)}"
     for name in named:
         if name not in given and parameters[name].default is inspect.Parameter.empty:
-            raise _Misnamed(f"{_joined(place, name)} is missing: {make.__name__} needs it")
+            return f"{_joined(place, name)} is missing: {make.__name__} needs it"
+    return ""
 
 
 def _plain_yaml(path: Path) -> Any:
@@ -253,17 +238,13 @@ def _plain_yaml(path: Path) -> Any:
     return yaml.load(text, loader)
 
 
-def _check_plain(node: Any, place: str = "") -> None:
+def _check_plain(config: Any) -> None:
     """Raise unless keys are texts and values are numbers, texts or nothing, none of them an interpolation."""
-    if isinstance(node, dict):
-        for key, value in node.items():
+    for place, value in _nodes(config, ""):
+        for key in value if isinstance(value, dict) else ():
             if not isinstance(key, str) or not key.isprintable() or len(key) > MAX_KEY or "${" in key:
                 raise ValueError(f"{place or 'config'}: keys must be short texts, got {str(key)[:MAX_KEY]!r}")
-            _check_plain(value, _joined(place, key))
-    elif isinstance(node, list):
-        for index, value in enumerate(node):
-            _check_plain(value, f"{place}[{index}]")
-    elif node is not None and not isinstance(node, str | int | float):
-        raise ValueError(f"{place} must be a number, a text or null, got {type(node).__name__}")
-    elif isinstance(node, str) and "${" in node:
-        raise ValueError(f"{place} must be a resolved value, got an interpolation '${{'")
+        if value is not None and not isinstance(value, dict | list | str | int | float):
+            raise ValueError(f"{place} must be a number, a text or null, got {type(value).__name__}")
+        if isinstance(value, str) and "${" in value:
+            raise ValueError(f"{place} must be a resolved value, got an interpolation '${{'")

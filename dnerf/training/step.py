@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import cast
 
 import torch
@@ -58,10 +59,7 @@ class Stepper:
         for name, value in self._weights.items():
             if isinstance(value, Tensor):
                 value.fill_(at(self.losses[name].weight, self.run.progress))
-
-        def work(indices: Tensor) -> dict[str, Tensor]:
-            return self._optimize(indices, turns)
-
+        work = partial(self._optimize, turns=turns)
         if self.graphs is None:
             found: Mapping[str, Tensor] = work(indices)
         else:

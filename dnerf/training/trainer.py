@@ -21,11 +21,10 @@ from dnerf.nn.encodings import FrameTimesAware
 from dnerf.rendering.cuda_graphs import GraphCache
 from dnerf.rendering.renderer import Renderer, has_fixed_capacity
 from dnerf.samplers import Capacity
-from dnerf.training.callbacks import Callback
 from dnerf.training.inheritance import take_over
 from dnerf.training.optimizer import AdamSettings
 from dnerf.training.records import Limits, TrainingRecord, not_finite
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 from dnerf.training.signals import StopRequest, TrainingStopped, stop_requests
 from dnerf.training.step import Stepper, next_num_rays, warm_up
 
@@ -124,10 +123,14 @@ class Trainer:
             MemoryError: saying what to lower, when a GPU's memory does not suffice.
             OSError: if the last checkpoint cannot be written.
         """
-        run = self.begin(renderer, frames, seed=seed, folder=folder, resume=resume)
+        if resume and not any(callback.resumes for callback in self.callbacks.values()):
+            given = ", ".join(type(callback).__name__ for callback in self.callbacks.values()) or "none"
+            raise ValueError(f"resume=True needs a callback that continues runs, such as Checkpoints, got {given}")
+        run = self.begin(renderer, frames, seed=seed)
         if begun is not None:
             take_over(run, begun)
-        run.callbacks = self.callbacks
+        run.callbacks, run.resume = self.callbacks, resume
+        run.folder = None if folder is None else Path(folder)
         for callback in self.callbacks.values():
             callback.on_train_begin(run)
         catching = nullcontext(StopRequest()) if folder is None else stop_requests()
@@ -139,22 +142,13 @@ class Trainer:
         assert run.last_record is not None
         return run.last_record
 
-    def begin(
-        self,
-        renderer: Renderer,
-        frames: Frames,
-        *,
-        seed: int = 0,
-        folder: str | Path | None = None,
-        resume: bool = False,
-    ) -> Run:
-        """A run before its first step, without callbacks; arguments and errors as of `fit`."""
+    def begin(self, renderer: Renderer, frames: Frames, *, seed: int = 0) -> Run:
+        """A run before its first step, without folder and callbacks; arguments and errors as of `fit`."""
         self.losses.load_state_dict(self._losses_at_first, strict=False)  # what they count begins anew, too
         run = Run(
             renderer, frames.to(renderer.device), self.optimizer.build(renderer),
             torch.Generator(renderer.device).manual_seed(seed), self.losses.to(renderer.device),
-            self.pixels.to(renderer.device), {}, None if folder is None else Path(folder), resume,
-            num_rays=self.num_rays, most_rays=max(self.num_rays, self.max_rays),
+            self.pixels.to(renderer.device), num_rays=self.num_rays, most_rays=max(self.num_rays, self.max_rays),
         )  # fmt: skip
         self._check(run)
         renderer.train()
@@ -182,9 +176,6 @@ class Trainer:
 
     def _check(self, run: Run) -> None:
         """Raise unless every part finds what it needs."""
-        if run.resume and not any(callback.resumes for callback in self.callbacks.values()):
-            given = ", ".join(type(callback).__name__ for callback in self.callbacks.values()) or "none"
-            raise ValueError(f"resume=True needs a callback that continues runs, such as Checkpoints, got {given}")
         if run.renderer.background.needs_alpha and not run.frames.is_transparent:
             raise ValueError("background: a random one needs frames with alpha, these have none")
         if self.graphs and not has_fixed_capacity(run.renderer.sampler):

@@ -34,10 +34,9 @@ def data_sheet(scene: SceneRecord, frames: Frames) -> Tensor:
     chosen = sorted({0, len(frames) // 2, len(frames) - 1}, key=lambda index: float(frames.times[index]))
     images = [_with_box(frames, index, corners) for index in chosen]
     sheet = Image.new("RGB", (SIDE * 3, SIDE * 2), "white")
-    for column, panel in enumerate(plans):
-        sheet.paste(panel, (column * SIDE, 0))
-    for column, panel in enumerate(images):
-        sheet.paste(panel, (column * SIDE, SIDE))
+    for row, panels in enumerate((plans, images)):
+        for column, panel in enumerate(panels):
+            sheet.paste(panel, (column * SIDE, row * SIDE))
     return torch.from_numpy(np.asarray(sheet).copy()).float() / 255
 
 

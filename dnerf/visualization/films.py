@@ -1,6 +1,6 @@
 """Films from the first frame to the finished files: rendered frame by frame, resumed, put together."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -47,26 +47,25 @@ def render_frames_to(
     if len(views) != store.num_frames:
         raise ValueError(f"views must be {store.num_frames} as the store's frames, got {len(views)}")
     missing = store.missing()
+    in_hand: list[tuple[int, Future[None]]] = []  # one at most
 
-    def finish(index: int, writing: Future[None]) -> None:
-        writing.result()
-        if on_frame is not None:
-            on_frame(index)
+    def finish() -> None:
+        while in_hand:
+            index, writing = in_hand.pop()
+            writing.result()
+            if on_frame is not None:
+                on_frame(index)
 
     # Most of the time that a file takes is waiting for the disk.
     with ThreadPoolExecutor(1) as writer:
-        in_hand: tuple[int, Future[None]] | None = None
         try:
             for index in missing:
                 following = views[index + 1] if index + 1 < len(views) else None
                 layers = render_layers(renderer, views[index], following, outputs, truth=truth, chunk=chunk, unit=unit)
-                previous, in_hand = in_hand, None
-                if previous is not None:
-                    finish(*previous)
-                in_hand = index, writer.submit(store.write, index, layers)
+                finish()
+                in_hand.append((index, writer.submit(store.write, index, layers)))
         finally:
-            if in_hand is not None:
-                finish(*in_hand)
+            finish()
     return len(missing)
 
 
@@ -136,36 +135,23 @@ def _images(store: FrameStore, output: str) -> Iterator[NDArray | torch.Tensor]:
             prediction, truth = (torch.from_numpy(frame[name]).float() / 255 for name in ("rgb", "truth"))
             yield comparison_sheet([(prediction, truth)])
     elif output == "motion":
-        longest = _longest_motion(store)
+        lengths = (torch.from_numpy(frame["motion"]).norm(dim=-1) for frame in store)
+        longest = _scale((length, length.isfinite()) for length in lengths)[1]
         yield from (flow_image(torch.from_numpy(frame["motion"]), longest) for frame in store)
     else:
-        low, high = _scale(store, output)
+        measured = ((torch.from_numpy(frame[output]), torch.from_numpy(frame["opacity"]) >= 0.5) for frame in store)
+        low, high = _scale(measured, from_zero=output == "deformation")
         for frame in store:
             values, opacity = torch.from_numpy(frame[output]), torch.from_numpy(frame["opacity"])
             yield scaled_image(values, opacity, low, high, label=SCALE_LABELS[output])
 
 
-def _scale(store: FrameStore, layer: str) -> tuple[float, float]:
-    ranges = []
-    for frame in store:
-        opaque = torch.from_numpy(frame["opacity"]) >= 0.5
-        if bool(opaque.any()):
-            ranges.append(value_range(torch.from_numpy(frame[layer]), opaque))
-    if not ranges:
-        return 0.0, 1.0
-    low = 0.0 if layer == "deformation" else min(low for low, _ in ranges)
-    high = max(high for _, high in ranges)
+def _scale(measured: Iterable[tuple[torch.Tensor, torch.Tensor]], *, from_zero: bool = True) -> tuple[float, float]:
+    """One range of all frames' values where their masks count them, never empty."""
+    ranges = [value_range(values, mask) for values, mask in measured if bool(mask.any())]
+    low = 0.0 if from_zero else min((low for low, _ in ranges), default=0.0)
+    high = max((high for _, high in ranges), default=low)
     return (low, high) if high > low else (low, low + 1.0)
-
-
-def _longest_motion(store: FrameStore) -> float:
-    longest = 0.0
-    for frame in store:
-        lengths = torch.from_numpy(frame["motion"]).norm(dim=-1)
-        known = lengths.isfinite()
-        if bool(known.any()):
-            longest = max(longest, value_range(lengths, known)[1])
-    return longest if longest > 0 else 1.0
 
 
 def _facts(views: Sequence[View], fps: float, world: World | None) -> dict[str, NDArray]:
@@ -176,9 +162,8 @@ def _facts(views: Sequence[View], fps: float, world: World | None) -> dict[str, 
         facts["data_times"] = np.array([clock.own(view.time) for view in views])
         poses = torch.stack([view.camera.pose.cpu() for view in views])
         facts["poses"] = (poses if similarity == IDENTITY else similarity.poses_from_world(poses)).numpy()
-        lenses, rows = [view.camera.intrinsics for view in views], []
-        for lens in lenses:
-            rows.append([lens.width, lens.height, lens.focal_x, lens.focal_y, *lens.center])
+        lenses = [view.camera.intrinsics for view in views]
+        rows = [(lens.width, lens.height, lens.focal_x, lens.focal_y, *lens.center) for lens in lenses]
         facts["intrinsics"] = np.array(rows)
         facts["pixel_origin"] = np.array([lens.pixel_origin for lens in lenses])
     return facts

@@ -103,9 +103,7 @@ def deformation_magnitude(renderer: Renderer, camera: Camera, time: float, *, ch
     """
     check_positive("chunk", chunk)
     rays, parts = camera.rays(time), []
-    modes = [(module, module.training) for module in renderer.modules()]
-    renderer.eval()
-    try:
+    with renderer.evaluating():
         for i in range(0, len(rays), chunk):
             part = rays[i : i + chunk]
             rendering = renderer(part)
@@ -115,9 +113,6 @@ def deformation_magnitude(renderer: Renderer, camera: Camera, time: float, *, ch
             lengths = (rendering.output.extras["canonical_positions"] - positions).norm(dim=-1)
             total = sum_along_rays(lengths, rendering.samples, rendering.weights)
             parts.append(safe_divide(total, rendering.opacity))
-    finally:
-        for module, mode in modes:
-            module.training = mode
     return torch.cat(parts).reshape(camera.intrinsics.height, camera.intrinsics.width).float()
 
 

@@ -1,6 +1,5 @@
 """Frames on their way to a film: one file each, written whole or not at all, so that a killed rendering can resume."""
 
-import re
 import shutil
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -31,11 +30,7 @@ class FrameStore:
 
     def missing(self) -> list[int]:
         """Indices of the frames that are not there, ascending."""
-        found = set()
-        if self.folder.is_dir():
-            names = (re.fullmatch(r"frame_(\d{5,})\.npz", file.name) for file in self.folder.iterdir())
-            found = {int(match[1]) for match in names if match}
-        return [i for i in range(self.num_frames) if i not in found]
+        return [i for i in range(self.num_frames) if not self.path(i).exists()]
 
     def write(self, index: int, layers: Layers) -> None:
         """Write a frame's layers."""

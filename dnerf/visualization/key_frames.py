@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -163,15 +162,9 @@ def _parse_key(where: str, entry: Any) -> dict[str, list[float]]:
 
 def _numbers(where: str, value: Any, count: int) -> list[float]:
     numbers: Sequence[Any] = value if isinstance(value, list) else [value]
-    fits = isinstance(value, list) == (count > 1) and len(numbers) == count
-    if not fits or not all(_is_finite(number) for number in numbers):
+    # A JSON true is a Python int, NaN fails the comparison, and an int may be too long for a float.
+    finite = [n for n in numbers if isinstance(n, int | float) and not isinstance(n, bool) and abs(n) <= 1e300]
+    if isinstance(value, list) != (count > 1) or len(numbers) != count or len(finite) != count:
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
         raise ValueError(f"{where} must be {expected}, got {value!r}")
-    return [float(n) for n in numbers]
-
-
-def _is_finite(value: Any) -> bool:
-    # A JSON true is a Python int, NaN is read as a float, and an int may be too long for one.
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    return abs(value) <= 1e300 and math.isfinite(value)
+    return [float(n) for n in finite]

@@ -46,14 +46,9 @@ class Surroundings:
             replace(most_frequent, distortion=None),
         )  # fmt: skip
 
-    @property
-    def are_all_around(self) -> bool:
-        """Whether no wide gap is between the cameras, seen from above."""
-        return self.arc >= 2 * math.pi
-
     def sway(self) -> tuple[float, float] | None:
         """The middle azimuth of the cameras and how far they go to either side; None if they stand all around."""
-        return None if self.are_all_around else (self.azimuth + 0.5 * self.arc, 0.5 * self.arc)
+        return None if self.arc >= 2 * math.pi else (self.azimuth + 0.5 * self.arc, 0.5 * self.arc)
 
 
 def _target(cameras: CameraSet, views: Viewpoints) -> Tensor:

@@ -13,6 +13,7 @@ from dnerf.core.cameras import Camera
 from dnerf.core.checks import check_positive, check_shape
 from dnerf.core.compositing import median_depth
 from dnerf.motion import Tracks, follow, motion_model
+from dnerf.motion.vectors import inside_image, nearest_value
 from dnerf.rendering.renderer import Renderer
 from dnerf.visualization.video import to_uint8
 
@@ -124,14 +125,11 @@ def render_tracks(
     colors = track_colors(points)
 
     def images() -> Iterator[Tensor]:
-        size = torch.tensor([camera.intrinsics.width, camera.intrinsics.height], device=points.device)
         for i in range((len(times) - 1) % every, len(times), every):
             rendering = renderer.render_image(camera, float(times[i]), chunk=chunk)
-            nearest = pixels[i].nan_to_num(nan=-1.0).round().long()
-            inside = ((nearest >= 0) & (nearest < size)).all(-1)
-            columns, rows = torch.where(inside[:, None], nearest, 0).unbind(-1)
             distance = (tracks.positions[i] - camera.pose[:3, 3]).norm(dim=-1)
-            visible = inside & (distance < rendering.depth[rows, columns] + tolerance)
+            in_front = distance < nearest_value(rendering.depth, pixels[i]) + tolerance
+            visible = inside_image(pixels[i], camera) & in_front
             yield draw_tracks(rendering.rgb, pixels[max(0, i - trail) : i + 1], visible, colors)
 
     return tracks, images()

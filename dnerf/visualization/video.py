@@ -126,7 +126,6 @@ def contact_sheet(
         columns: headings.
         rows: a label for each row, or none.
     """
-    check_positive("MARGIN", MARGIN)
     if not images or not columns or any(len(row) != len(columns) for row in images):
         raise ValueError(f"images must have rows of {len(columns)} > 0, got {[len(row) for row in images]}")
     if rows and len(rows) != len(images):

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from dnerf.deformations import Deformation
-from dnerf.deformations.jacobian import folding
+from dnerf.deformations.inversion import folding
 
 
 class Squash(Deformation):

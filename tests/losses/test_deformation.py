@@ -12,7 +12,7 @@ from torch import Tensor
 from benchmarks.closed_flows import Expansion, Rotation
 from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.deformations import AlongRaysDeformation, Deformation, DisplacementDeformation, FlowDeformation
-from dnerf.deformations.jacobian import folding
+from dnerf.deformations.inversion import folding
 from dnerf.deformations.velocities import NetworkVelocity, Velocity
 from dnerf.fields import DeformedField, GridField, RadianceField
 from dnerf.losses import AppearanceConstancyLoss, Batch, ElasticLoss, JacobianDeterminantLoss, RestLoss, VolumeLoss

@@ -9,7 +9,7 @@ from dnerf.deformations import Deformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, NeuSField, RadianceField
 from dnerf.fields.normals import differences
 from dnerf.losses import Batch, EikonalLoss
-from dnerf.losses.surfaces import canonical_surface
+from dnerf.losses.regularizers import canonical_surface
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 

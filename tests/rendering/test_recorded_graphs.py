@@ -17,11 +17,10 @@ from dnerf.deformations import DisplacementDeformation, FlowChain, FlowDeformati
 from dnerf.deformations.velocities import NetworkVelocity
 from dnerf.rendering.renderer import Renderer
 from dnerf.scenes import make_scene
-from dnerf.training.callbacks import Callback
 from dnerf.training.optimizer import AdamSettings
 from dnerf.training.records import TrainingRecord
 from dnerf.training.recovery import Recovery
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 from dnerf.training.trainer import Trainer
 
 

@@ -16,11 +16,10 @@ from dnerf.fields import DeformedField, GridField
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
-from dnerf.training.callbacks import Callback
 from dnerf.training.optimizer import AdamSettings
 from dnerf.training.records import TrainingRecord
 from dnerf.training.recovery import Recovery
-from dnerf.training.run import Run
+from dnerf.training.run import Callback, Run
 from dnerf.training.trainer import Trainer
 
 BOX = [[-1.5] * 3, [1.5] * 3]

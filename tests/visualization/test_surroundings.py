@@ -31,7 +31,6 @@ def test_a_ring_of_cameras_gives_its_own_middle_distance_and_height() -> None:
     found = Surroundings.of(cameras(ring(360)))
     assert found.target == (0.0, 0.0, 0.0)
     assert (found.radius, found.elevation) == pytest.approx((3.0, 0.5), abs=1e-5)
-    assert found.are_all_around
     assert found.sway() is None
 
 
