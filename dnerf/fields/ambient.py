@@ -14,9 +14,9 @@ from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup, network_gr
 class AmbientCoordinates(SpaceTimeFeatures, DeclaresGroups):
     """Coordinates w(x, t) that a slicing network gives, encoded: the head sees one canonical scene for each w.
 
-    A deformation cannot tear or join what it moves. Here matter that parts, meets or vanishes is a smooth way through
-    canonical scenes of more dimensions. The network begins at zero, and so do all of its features: a fresh field is as
-    without it.
+    A deformation cannot tear or join what it moves. Here what parts, meets or vanishes is a smooth way through
+    canonical scenes of more dimensions. The network begins at zero, and with a window so do all features: a fresh
+    field is as without them.
 
     Source: HyperNeRF (arXiv 2106.13228) section 3.2 and eq. 7, "deformable slicing surface", with a window as of its
     section 4.1. Deviations: time is encoded, with embeddings, in place of a latent code for each frame; behind a

@@ -66,7 +66,7 @@ class DeformedField(RadianceField, IntervalAware, SignedDistance):
     def distance(self, positions: Tensor, times: Tensor) -> Tensor:
         """The canonical field's distance (...,) at positions (..., 3), which need not lie on rays, and times (...,)."""
         surface = surface_of(self.canonical)
-        assert surface is not None, "asked only if has_surface"
+        assert surface is not None, "called only if has_surface"
         return surface.distance(unwrapped(self.deformation)(positions, times), times)
 
     def between(self, starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
@@ -75,7 +75,7 @@ class DeformedField(RadianceField, IntervalAware, SignedDistance):
         The extra "canonical_positions" is the middle of that interval.
         """
         canonical = interval_aware(self.canonical)
-        assert canonical is not None, "asked only if knows_intervals"
+        assert canonical is not None, "called only if knows_intervals"
         all_ends = ends_of(starts, ends, directions, times)
         first, last = all_ends.pairs(self.deformation(all_ends.positions, all_ends.times))
         output = canonical.between(first, last, directions, times)

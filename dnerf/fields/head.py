@@ -38,7 +38,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         num_layers: hidden layers of the head.
         time_frequencies: octaves of a time encoding that the head sees; None for a head that does not depend on time.
         temporal_terms: terms K of a cosine series in time, cos(k pi t) for k < K, that density and colour follow before
-            their activations: folds and shading that change while matter moves. 1 for matter that is carried along
+            their activations: folds and shading that change with motion. 1 for what is carried along
             and never changes.
         space_time: features of place and time that the head sees, too: for what moves too fast, or in too many ways,
             for a deformation to follow. None for a head that does not see any.

@@ -44,7 +44,7 @@ def differences(surface: SignedDistance, positions: Tensor, times: Tensor, step:
     return ((up - down) / (2 * step)).mT
 
 
-class NormalField(RadianceField, IntervalAware):
+class NormalField(RadianceField, IntervalAware, SignedDistance):
     """A field whose colour is its normal n, as (n + 1) / 2: the same renderer makes images of normals.
 
     Composited without a background, 2 rgb - opacity is the weighted sum of normals, see `normals_of_image`.
@@ -64,6 +64,17 @@ class NormalField(RadianceField, IntervalAware):
         """Whether the field does."""
         return interval_aware(self.field) is not None
 
+    @property
+    def has_surface(self) -> bool:
+        """Whether the field has one."""
+        return surface_of(self.field) is not None
+
+    def distance(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Signed distance (...,) of the field."""
+        surface = surface_of(self.field)
+        assert surface is not None, "called only if has_surface"
+        return surface.distance(positions, times)
+
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
         """The density of the field at that time, with the same normals."""
         return NormalField(field_at_time(self.field, time, extent), self.exact)
@@ -79,7 +90,7 @@ class NormalField(RadianceField, IntervalAware):
     def between(self, starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Mean density (...,) of the field's intervals, and normals in their middle as rgb (..., 3)."""
         aware = interval_aware(self.field)
-        assert aware is not None, "asked only if knows_intervals"
+        assert aware is not None, "called only if knows_intervals"
         density = aware.between(starts, ends, directions, times).density
         return self._with_normals(density, 0.5 * (starts + ends), times)
 

@@ -28,7 +28,7 @@ class SDFField(GridField, SignedDistance):
         box, resolutions, num_features, max_rows, hidden_features, num_layers, view_degree, window_end: see `GridField`.
         radius: r, as a share of half the box's shortest side.
         width: of the surface at the start, in world units, added to `least_width`.
-        least_width: below which training makes no surface; of that a sampler's steps have to see something.
+        least_width: the smallest there can be; a sampler's intervals should not be much longer.
 
     Raises:
         ValueError: for a box, resolutions or sizes out of range.
@@ -65,11 +65,18 @@ class SDFField(GridField, SignedDistance):
         """Side () of a cell of the finest level that is more than half open."""
         if self.window_end is None:
             return self.cell_sizes[-1]
-        return self.cell_sizes[(self.window > 0.5).sum().clamp(min=1) - 1]
+        finest = (self.window > 0.5).sum().clamp(min=1) - 1
+        return self.cell_sizes.index_select(0, finest[None])[0]  # without waiting for a device
 
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
         """Itself."""
         return self
+
+    def _linear(self, positions: Tensor, times: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """In full precision: surfaces are thinner than what bfloat16 tells apart."""
+        seen = self.head.before_output(*self._inputs(positions, times))
+        with torch.autocast(positions.device.type, enabled=False):
+            return nn.functional.linear(seen.to(weight.dtype), weight, bias)
 
     def _distance(self, positions: Tensor, raw: Tensor) -> Tensor:
         """Distance (...,) of the head's first output (...,)."""

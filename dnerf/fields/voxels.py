@@ -17,7 +17,7 @@ from dnerf.fields.head import VIEW_SCALE
 from dnerf.kernels import GridLevels, grid_encode
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
-COPIES = 4  # of each number in training: the weight, its gradient, Adam's two moments
+COPIES = 8  # of each number in training: weight, gradient, Adam's moments, what recovery keeps of them, the average
 LAYERS = 16  # of a table that roughness looks at: at all of 256 cells each way, it takes as long as fifty steps
 
 
@@ -80,8 +80,8 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         gib = COPIES * 4 * (4 * sum(rows) + columns * sum(rows[: self.num_viewed])) / 2**30
         if gib > max_gib:
             raise ValueError(
-                f"resolutions {list(resolutions)} need {gib:.1f} GiB in training, for weights, gradients and Adam's "
-                f"moments, of max_gib={max_gib:g}: use coarser ones, a lower view_resolution, or raise max_gib"
+                f"resolutions {list(resolutions)} need {gib:.1f} GiB in training, with gradients, moments "
+                f"and copies, of max_gib={max_gib:g}: use coarser ones, a lower view_resolution, or raise max_gib"
             )
         self.levels = tuple(GridLevels([c], 1 << (n - 1).bit_length()) for c, n in zip(cells, rows, strict=True))
         self.density_activation, self.density_shift = density_activation, density_shift

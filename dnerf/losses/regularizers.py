@@ -83,8 +83,9 @@ class UnseenSpaceLoss(PlacesLoss):
         self.last_seen = nn.Buffer(torch.full((resolution,) * 3, -memory_samples - 1, dtype=torch.int64))
 
     def check(self, model: Renderer) -> None:
-        """Needs a deformed field, and a sampler that knows which cells are occupied, whose box it may take."""
-        deformed(model, self)
+        """Needs a deformed field of density, and a sampler that knows occupied cells, whose box it may take."""
+        if surface_of(deformed(model, self).canonical):
+            raise ValueError("UnseenSpaceLoss needs a density field: a signed distance is full where no ray sees it")
         if not isinstance(model.sampler, OccupancyAware):
             raise ValueError(f"UnseenSpaceLoss needs an occupancy-aware sampler, got {type(model.sampler).__name__}")
         if self.takes_box:

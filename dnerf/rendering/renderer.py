@@ -16,7 +16,7 @@ from dnerf.core.quadrature import check_rule
 from dnerf.core.rays import Rays, Samples
 from dnerf.core.schedules import Scheduled
 from dnerf.core.shortcuts import speaks_for
-from dnerf.fields.base import RadianceField, evaluate_samples
+from dnerf.fields.base import RadianceField, evaluate_samples, interval_aware
 from dnerf.rendering.exposure import Exposure
 from dnerf.rendering.frame_graphs import FrameGraphs
 from dnerf.rendering.image import image_columns
@@ -50,8 +50,8 @@ class Renderer(nn.Module):
         exposure: of the training images' camera, in training mode; images show the scene without it. None for none.
 
     Raises:
-        ValueError: for another precision or quadrature, a transmittance outside [0, 1), or graphs with a sampler that
-            has no fixed capacity.
+        ValueError: for another precision or quadrature, one that reads densities at points of a field that knows
+            intervals, a transmittance outside [0, 1), or graphs with a sampler that has no fixed capacity.
     """
 
     def __init__(
@@ -64,6 +64,8 @@ class Renderer(nn.Module):
             raise ValueError(f"stop_transmittance must be in [0, 1), got {stop_transmittance}")
         check_rule(quadrature)
         check_choice("precision", precision, tuple(PRECISIONS))
+        if quadrature != "constant" and interval_aware(field):
+            raise ValueError(f"quadrature must be constant for a field that knows intervals, got {quadrature!r}")
         if graphs and not has_fixed_capacity(sampler):
             raise ValueError(f"graphs needs a sampler with a fixed capacity, got {type(sampler).__name__}")
         self.field = field

@@ -12,6 +12,7 @@ from dnerf.core.rays import Rays, Samples
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, NeuSField, SDFField, VolSDFField
 from dnerf.fields.base import ends_of, evaluate_samples, interval_aware, surface_of
+from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 
 BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
@@ -205,3 +206,21 @@ def test_detail_follows_the_levels_that_are_open() -> None:
     for progress, cell in ((0.0, 1.0), (0.25, 0.5), (0.5, 0.25), (1.0, 0.25)):
         field.set_progress(progress)
         assert float(field.detail) == cell
+
+
+def test_distances_keep_their_precision_under_autocast() -> None:
+    field = small(NeuSField).float().requires_grad_(False)
+    with torch.no_grad():
+        field.head.output.bias[0] = 0.75  # between 0.5 and 1 bfloat16 tells apart 0.004
+    positions = torch.rand(64, 3)
+    exact = field.distance(positions, torch.zeros(64))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        rounded = field.distance(positions, torch.zeros(64))
+    assert rounded.dtype == torch.float32
+    torch.testing.assert_close(rounded, exact, rtol=0, atol=5e-4)  # hidden features are small, and rounded
+
+
+def test_rules_that_read_densities_at_points_are_refused() -> None:
+    with pytest.raises(ValueError, match="quadrature must be constant"):
+        Renderer(moved(small(NeuSField)), StratifiedSampler(4), quadrature="linear")
+    Renderer(moved(small(VolSDFField)), StratifiedSampler(4), quadrature="linear")

@@ -212,7 +212,7 @@ def test_roughness_is_of_differences_between_neighbours() -> None:
     ({"view_degree": 5}, "view_degree must be one of 0, 1, 2, 3, 4; got 5"),
     ({"density_scale": 0}, "density_scale must be > 0 and finite, got 0"),
     ({"window_end": 0}, "window_end must be in (0, 1] or None, got 0"),
-    ({"resolutions": (4096,), "view_degree": 0}, "resolutions [4096] need 512.9 GiB in training, for weights,"),
+    ({"resolutions": (4096,), "view_degree": 0}, "resolutions [4096] need 1025.8 GiB in training, with gradients,"),
 ])  # fmt: skip
 def test_bad_voxels_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(ValueError) as error:

@@ -8,7 +8,7 @@ from dnerf.core.rays import Rays
 from dnerf.deformations import Deformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, NeuSField, RadianceField
 from dnerf.fields.normals import differences
-from dnerf.losses import Batch, EikonalLoss
+from dnerf.losses import Batch, EikonalLoss, UnseenSpaceLoss
 from dnerf.losses.regularizers import canonical_surface
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
@@ -80,3 +80,21 @@ def test_fields_without_a_surface_are_named() -> None:
     assert canonical_surface(grid) is None
     with pytest.raises(ValueError, match="EikonalLoss needs a field with a signed distance, got DeformedField"):
         EikonalLoss(BOX).check(Renderer(grid, StratifiedSampler(8)))
+
+
+def test_unseen_insides_of_surfaces_are_not_emptied() -> None:
+    model = Renderer(DeformedField(IdentityDeformation(), slope(1.0)), StratifiedSampler(4))
+    with pytest.raises(ValueError, match="needs a density field"):
+        UnseenSpaceLoss(BOX).check(model)
+
+
+def test_the_batch_s_own_samples_count() -> None:
+    """Steep in a slab that all rays lie in, and a twentieth of the places of the box."""
+
+    class Steep(Slope):
+        def _distance(self, positions: Tensor, raw: Tensor) -> Tensor:
+            x = positions[..., 1]
+            return positions[..., 2] + torch.where(x.abs() < 0.05, 5 * x, 0) + 0 * raw
+
+    field = DeformedField(IdentityDeformation(), Steep(BOX, (512,), 2, max_rows=1024))
+    assert float(term(field).detach()) > 4.0  # half of (sqrt(26) - 1)^2 = 16.8, by the samples
