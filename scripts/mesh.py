@@ -4,7 +4,6 @@ Writes one animated glTF (mesh.glb), or a PLY or OBJ file for each frame.
 """
 
 import time
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -12,8 +11,8 @@ from hydra_app import load_config, load_renderer, load_scene, resolve_device, ru
 from omegaconf import DictConfig
 
 from dnerf.core.checks import check_choice
-from dnerf.fields import TimeDependence
-from dnerf.meshing import FORMATS, Animation, extract_surface, meshes_through_time, write_gltf, write_meshes
+from dnerf.fields import RadianceField, TimeDependence
+from dnerf.meshing import FORMATS, Mesh, extract_surface, mesh_through_time, write_gltf, write_meshes
 
 
 def main(config: DictConfig) -> None:
@@ -27,22 +26,33 @@ def main(config: DictConfig) -> None:
     renderer = load_renderer(config.run, saved, resolve_device(config.device))
     begun = time.perf_counter()
     start = sum(scene.times) / 2 if config.time is None else config.time
-    names = ("resolution", "level", "min_share", "close_gaps")
-    extract = partial(extract_surface, box=scene.world.box, **{name: config[name] for name in names})
+
+    def extract(field: RadianceField, time: float) -> Mesh:
+        return extract_surface(
+            field, time, box=scene.world.box, resolution=config.resolution, level=config.level,
+            min_share=config.min_share, close_gaps=config.close_gaps,
+        )  # fmt: skip
+
     times = torch.linspace(*scene.times, config.num_frames)
-    meshes = meshes_through_time(renderer.field, times, extract, start=start)
-    if isinstance(meshes, Animation):
-        print(meshes.summary())
+    moving = mesh_through_time(renderer.field, times, extract, start=start)
+    if moving is None and "glb" in formats:
+        raise ValueError(
+            "format must be ply or obj: this run's field changes without a deformation, so each frame has triangles of "
+            "its own, which glTF cannot animate"
+        )
+    if moving is not None:
+        print(moving.summary())
         canonical = getattr(renderer.field, "canonical", None)
         if isinstance(canonical, TimeDependence) and not canonical.is_static:
             print(f"the canonical field changes with time: shape and colours are those of time {start:.3g}")
     folder, similarity = Path(config.output or Path(config.run) / "meshes"), scene.world.similarity
-    for format in sorted(formats):  # glb first: it may be refused
-        if format == "glb":
+    for format in formats:
+        if format == "glb" and moving is not None:
             settings = {"fps": config.fps, "every": config.key_every, "interpolation": config.interpolation}
-            path = write_gltf(meshes, folder / "mesh.glb", similarity=similarity, **settings)
+            path = write_gltf(moving, folder / "mesh.glb", similarity=similarity, **settings)
         else:
-            frames = map(meshes.frame, range(len(meshes.times)))
+            own = (extract(renderer.field, time) for time in times.tolist())
+            frames = own if moving is None else map(moving.frame, range(len(moving.times)))
             path = write_meshes(frames, folder / format, format, similarity=similarity)
         print(f"{format}: {path}")
     print(f"{time.perf_counter() - begun:.1f} s")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -45,55 +46,41 @@ class Animation:
         )
 
 
-@dataclass(frozen=True)
-class SeparateMeshes:
-    """Meshes that have triangles of their own at each time, made when they are wanted."""
-
-    times: Tensor  # (T,) in [0, 1]
-    extract: Callable[[float], Mesh]
-
-    def frame(self, index: int) -> Mesh:
-        """The mesh of one frame."""
-        return self.extract(self.times[index].item())
-
-
-def meshes_through_time(
+def mesh_through_time(
     field: RadianceField, times: Tensor, extract: Callable[[RadianceField, float], Mesh], *, start: float
-) -> Animation | SeparateMeshes:
-    """What a field's surface is at each time: one mesh that moves, or one for each time where no motion is known.
+) -> Animation | None:
+    """A field's surface, moved to each of some times; None if its motion is not known, so that each has its own.
 
-    Behind a deformation the canonical surface moves. A static field has one frame.
+    Behind a deformation the canonical surface of the time `start` moves; a static field has one frame.
 
     Args:
         field: in evaluation mode.
         times: (T,) in [0, 1], T > 0, rising.
         extract: gives the surface of a field at a time, see `extract_surface`.
-        start: time in [0, 1] of the canonical surface, should the canonical field change, and where inverses begin.
+        start: time in [0, 1] of the canonical surface, should that change, and where inverses begin.
     """
     motion = motion_model(field)
     if not isinstance(motion, Deformation):
-        return SeparateMeshes(times, lambda time: extract(field, time))
-    if isinstance(field, DeformedField) and not motion.is_identity:
-        return animate(extract(field.canonical, start), field.deformation, times, start=start)
-    mesh = extract(field, start)
-    is_found = torch.ones(1, len(mesh.vertices), dtype=torch.bool)
-    return Animation(mesh, times.new_tensor([start]), mesh.vertices[None], is_found)
+        return None
+    if motion.is_identity:
+        return animate(extract(field, start), motion, times.new_tensor([start]))
+    deformed = cast(DeformedField, field)
+    return animate(extract(deformed.canonical, start), deformed.deformation, times, start=start)
 
 
 @torch.no_grad()
 def animate(mesh: Mesh, deformation: Deformation, times: Tensor, *, start: float = 0.5) -> Animation:
     """Carry a canonical mesh to each time: world = deformation^-1(canonical, time).
 
-    A deformation with a stand-in for one frame (`PerFrame`) is inverted as images see it. Where no place is found, a
-    vertex moves as its neighbours do; those found in less than half of the frames are left out with their faces:
-    canonical space may hold what no frame shows.
+    A deformation with a stand-in for one frame (`PerFrame`) is inverted as images see it. A vertex for which no place
+    is found moves as its neighbours do. Canonical space may hold what no frame shows: vertices that are found in less
+    than half of the frames are left out.
 
     Args:
         mesh: in canonical space.
         deformation: world -> canonical, in evaluation mode.
         times: (T,) in [0, 1], T > 0, rising.
-        start: frames are visited outwards from this time, so that an inverse without a closed form begins where the
-            vertex was a frame before.
+        start: frames are visited outwards from this time, for inverses to begin where vertices were a frame before.
 
     Raises:
         ValueError: for times that are none, or if no triangle is found in half of the frames.

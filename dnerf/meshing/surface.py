@@ -18,9 +18,8 @@ from dnerf.fields.normals import normals
 MOST_AT_ONCE = 1 << 18  # positions evaluated in one go: bounds the memory of networks
 BYTES_PER_POINT = 16  # of the lattice: values, and what marching cubes makes of them
 OPAQUE_LENGTH = 0.01  # share of the box's longest side in which the surface of a density absorbs half the light
-LEAST_SHARE = 1e-6  # of the level, as which no density counts: its logarithm is not finite
 EPSILON = 1e-7  # for values of zero, which have no side
-ROUNDS = 6  # of the search along a lattice edge: linear values take one, exponential ones five
+ROUNDS = 6  # of the search along a lattice edge
 
 Values = Callable[[Tensor, Tensor], Tensor]
 """Positions (N, n) and times (N,) to numbers (N, ...)."""
@@ -43,25 +42,24 @@ def extract_surface(
 ) -> Mesh:  # fmt: skip
     """The surface of a field at a time, closed where the box cuts it.
 
-    Of a `SignedDistance` it is where the distance is `level`, of other fields where the density is. Densities have no
-    surface of their own; the default level takes one where half the light is absorbed within `OPAQUE_LENGTH` of the
-    box, which does not depend on the lattice. Vertices lie on lattice edges and are searched for there, since densities
-    between lattice points are far from linear. Each vertex has the colour that is seen from outside, along minus its
-    normal. Cavities are filled: no image has seen what lies in them.
+    Of a `SignedDistance` it is where the distance is `level`, of other fields where the density is. A density has no
+    surface of its own; by default it is taken where half the light is absorbed within `OPAQUE_LENGTH` of the box,
+    whatever the lattice. Vertices lie on lattice edges and are searched for there, since densities are far from linear.
+    Colours are those seen from outside, along minus the normal. Cavities, whose insides no image shows, are filled.
 
     Args:
         field: in world or canonical space, in evaluation mode.
         time: in [0, 1].
         box: (2, 3) corners of the lattice.
-        resolution: cells of the lattice along the box's longest side; cells are cubes.
+        resolution: cells, which are cubes, along the box's longest side.
         level: distance, in world units, or density, in 1 / world unit; None for 0 or the default above.
-        min_share: connected parts with less than this share of the largest part's triangles are left out; 0 for none.
-        close_gaps: width, as a share of the box's longest side, of gaps that are closed where a cavity lies behind
-            them. Density fields are often hollow, with a skin that has pinholes.
+        min_share: connected parts with less than this share of the largest part's triangles are left out.
+        close_gaps: width, as a share of the box's longest side, of gaps into cavities that are closed. Density fields
+            are often hollow, with a skin that has pinholes.
 
     Raises:
-        ValueError: if nothing crosses the level, the lattice is too large for this machine's memory, a setting is out
-            of range or the extra is missing.
+        ValueError: if nothing crosses the level, the lattice is too large for the memory, a setting is out of range or
+            the extra is missing.
     """
     check_whole("resolution", resolution)
     for name, share in (("min_share", min_share), ("close_gaps", close_gaps)):
@@ -72,11 +70,15 @@ def extract_surface(
     surface, now = surface_of(field), field_at_time(field, time)
     if level is None:
         level = math.log(2) / (OPAQUE_LENGTH * size) if surface is None else 0.0
-    of_field = _of_density(now, level) if surface is None else surface.distance
+    if surface is None:
+        check_positive("level", level)
 
     def values(x: Tensor) -> Tensor:
         """Negative inside the field's shape and the box."""
-        inside = _evaluated(field, of_field, x, time) - (0.0 if surface is None else level)
+        if surface is None:  # the logarithm is linear where density falls exponentially
+            inside = math.log(level) - _evaluated(field, now.density, x, time).clamp(min=1e-6 * level).log()
+        else:
+            inside = _evaluated(field, surface.distance, x, time) - level
         return torch.maximum(inside, ((x - center).abs() - (corners[1] - center)).amax(-1))
 
     low, spacing = corners[0] - size / resolution, size / resolution
@@ -98,10 +100,18 @@ def extract_surface(
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Unit normals (V, 3) of vertices (V, 3): the mean of the triangles (F, 3) around each, by their areas."""
-    a, b, c = vertices[faces].unbind(1)
-    areas = torch.linalg.cross(b - a, c - a)
-    return safe_normalize(torch.zeros_like(vertices).index_add_(0, faces.reshape(-1), areas.repeat_interleave(3, 0)))
+    """Unit normals (V, 3) of vertices (V, 3): a mean over the triangles (F, 3) around each, exact on balls.
+
+    The cross products of a corner's edges, over the squares of both lengths (Max 1999, "Weights for computing vertex
+    normals from facet normals"): marching cubes makes slivers, which other weights are sensitive to.
+    """
+    corners, result = vertices[faces], torch.zeros_like(vertices)
+    for i in range(3):
+        first, second = corners[:, i - 2] - corners[:, i], corners[:, i - 1] - corners[:, i]
+        lengths = first.square().sum(-1) * second.square().sum(-1)
+        weights = torch.where(lengths > 0, 1 / lengths, 0)[:, None]
+        result.index_add_(0, faces[:, i], weights * torch.linalg.cross(first, second))
+    return safe_normalize(result)
 
 
 def imported(module: str) -> Any:
@@ -123,12 +133,6 @@ def _evaluated(field: RadianceField, function: Values, positions: Tensor, time: 
     with torch.autocast(device.type, enabled=False):  # bfloat16 would make terraces
         parts = (part.to(device) for part in positions.split(MOST_AT_ONCE))
         return torch.cat([function(part, part.new_full(part.shape[:1], time)).float().cpu() for part in parts])
-
-
-def _of_density(field: RadianceField, level: float) -> Values:
-    """The logarithm of level by density: where density falls exponentially it is linear."""
-    check_positive("level", level)
-    return lambda x, times: math.log(level) - field.density(x, times).clamp(min=LEAST_SHARE * level).log()
 
 
 def _lattice(values: Callable[[Tensor], Tensor], box: Tensor, spacing: float) -> Tensor:
@@ -181,13 +185,15 @@ def _refined(
     first, step = first[chosen], along[chosen].to(first.dtype)
     value_a, value_b = ends[0][chosen], ends[1][chosen]
     a, b = torch.zeros_like(value_a), torch.ones_like(value_a)
-    at = a
+    at, before = a, torch.zeros_like(value_a)
     for _ in range(ROUNDS):
-        at = (a - value_a * (b - a) / (value_b - value_a)).clamp(1e-3, 1 - 1e-3)  # apart from others at this point
+        at = (a - value_a * (b - a) / (value_b - value_a)).clamp(1e-4, 1 - 1e-4)  # apart from others at this point
         value = values(low + spacing * (first + at[:, None] * step))
         is_a = (value < 0) == (value_a < 0)
-        # The end that stays counts half: otherwise it would stay for ever.
-        value_a, value_b = torch.where(is_a, value, 0.5 * value_a), torch.where(is_a, 0.5 * value_b, value)
+        # An end that stays twice counts half: otherwise it would stay for ever.
+        share = torch.where((value < 0) == (before < 0), 0.5, 1.0)
+        value_a, value_b = torch.where(is_a, value, share * value_a), torch.where(is_a, share * value_b, value)
+        before = value
         a, b = torch.where(is_a, at, a), torch.where(is_a, b, at)
     vertices[chosen] = first + at[:, None] * step
     return low + spacing * vertices

@@ -13,11 +13,10 @@ from torch import Tensor
 from dnerf.core.checks import check_choice, check_positive, check_whole
 from dnerf.core.files import replaced_folder, write_bytes
 from dnerf.data.normalization import IDENTITY, Similarity
-from dnerf.meshing.animation import Animation, SeparateMeshes
+from dnerf.meshing.animation import Animation
 from dnerf.meshing.surface import Mesh, imported
 
 FORMATS = ("ply", "obj")
-INTERPOLATIONS = ("linear", "step")
 MOST_BYTES = 2**32 - 2**20  # of a GLB file, whose length is a 32-bit number; some are left for the header
 COMPONENTS = {torch.float32: 5126, torch.uint16: 5123, torch.uint32: 5125}  # glTF 2.0, section 3.6.2.2
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # by columns
@@ -65,7 +64,7 @@ def write_meshes(
 
 
 def write_gltf(
-    meshes: Animation | SeparateMeshes, path: str | Path, *, fps: float = 20.0, every: int = 1,
+    animation: Animation, path: str | Path, *, fps: float = 20.0, every: int = 1,
     interpolation: str = "linear", similarity: Similarity = IDENTITY,
 ) -> Path:  # fmt: skip
     """Write a mesh that moves as one binary glTF 2.0 file; returns the path.
@@ -75,7 +74,7 @@ def write_gltf(
     light as the images show it, so the material is unlit; glTF wants them linear, images are sRGB.
 
     Args:
-        meshes: in world units.
+        animation: in world units.
         path: ends in .glb.
         fps: frames in a second: frame i stands at i / fps.
         every: one key frame of so many frames, the last one among them.
@@ -83,21 +82,15 @@ def write_gltf(
         similarity: see `write_meshes`.
 
     Raises:
-        ValueError: for meshes with triangles of their own, settings out of range, another suffix, a file larger than
-            the format can be or a missing extra.
+        ValueError: for settings out of range, another suffix, a file of more than 4 GiB or a missing extra.
     """
-    if isinstance(meshes, SeparateMeshes):
-        raise ValueError(
-            "glb needs a field that moves by a deformation: this one changes without, so each frame has triangles of "
-            "its own, which glTF cannot animate; take ply or obj"
-        )
     if Path(path).suffix.lower() != ".glb":
         raise ValueError(f"path must be a file that ends in .glb, got {path}")
     check_positive("fps", fps)
     check_whole("every", every)
-    check_choice("interpolation", interpolation, INTERPOLATIONS)
-    keys = [*range(0, len(meshes.times) - 1, every), len(meshes.times) - 1]
-    first = own_units(meshes.frame(0), similarity)
+    check_choice("interpolation", interpolation, ("linear", "step"))
+    keys = [*range(0, len(animation.times) - 1, every), len(animation.times) - 1]
+    first = own_units(animation.frame(0), similarity)
     if (len(keys) + 3) * 12 * len(first.vertices) + 12 * len(first.faces) > MOST_BYTES:
         raise ValueError(f"every must leave a file of less than 4 GiB, got {len(keys)} key frames; choose a larger one")
     lib, blob = imported("pygltflib"), bytearray()
@@ -122,7 +115,7 @@ def write_gltf(
         COLOR_0=add(_linear_colours(first.rgb), VERTICES),
     )  # fmt: skip
     indices = add(first.faces.reshape(-1, 1).to(torch.uint32), INDICES)
-    frames = (own_units(meshes.frame(key), similarity).vertices for key in keys[1:])
+    frames = (own_units(animation.frame(key), similarity).vertices for key in keys[1:])
     targets = [{"POSITION": add(moved - first.vertices, VERTICES)} for moved in frames]
     gltf.meshes = [lib.Mesh(name="surface", weights=[0.0] * len(targets), primitives=[
         lib.Primitive(attributes=attributes, indices=indices, material=0, targets=targets)

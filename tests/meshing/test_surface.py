@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from exact import BOX, CENTER, ExactSurface, Fog, ball, box, capsule, torus
+from exact_shapes import BOX, CENTER, ExactSurface, Fog, ball, box, capsule, torus
 
 from dnerf.deformations import IdentityDeformation
 from dnerf.fields import DeformedField
@@ -48,14 +48,17 @@ def test_surface_is_closed_has_the_right_genus_and_faces_outwards(shape):
 
 @SHAPES
 def test_errors_of_distance_and_volume_fall_with_the_square_of_the_spacing(shape):
-    meshes = [extract(ExactSurface(shape), resolution=resolution) for resolution in (24, 48, 96)]
-    volumes = [abs(solid(mesh).volume / VOLUMES[shape] - 1) for mesh in meshes]
-    means = [float(distances(shape, mesh).mean()) for mesh in meshes]
-    # Two octaves: 2^4. Where lattices meet edges is by chance, so the box's come with a factor of two.
-    assert volumes[0] / volumes[2] > (8 if shape is box else 12)
-    assert means[0] / means[2] > (8 if shape is box else 12)
-    assert volumes[2] < 1.5e-3
-    assert means[2] < 3e-4  # of shapes one in size
+    errors = []
+    for resolution in (24, 48, 96):
+        # Where lattice points lie beside an edge is chance: the mean over some lattices.
+        boxes = [torch.tensor(BOX) + shift * torch.tensor([0.031, 0.017, -0.013]) for shift in range(4)]
+        meshes = [extract(ExactSurface(shape), box=shifted, resolution=resolution) for shifted in boxes]
+        volumes = [abs(solid(mesh).volume / VOLUMES[shape] - 1) for mesh in meshes]
+        errors.append([np.mean(volumes), np.mean([distances(shape, mesh).mean() for mesh in meshes])])
+    orders = np.log2(np.divide(errors[0], errors[2])) / 2
+    assert (orders > 1.8).all(), orders
+    assert errors[2][0] < 2e-3
+    assert errors[2][1] < 3e-4  # of shapes one in size
 
 
 @SHAPES
@@ -63,7 +66,7 @@ def test_vertices_lie_on_the_surface_and_reach_all_of_it(shape):
     from scipy.spatial import cKDTree
 
     mesh = extract(ExactSurface(shape), resolution=48)
-    assert shape(mesh.vertices).abs().max() < (2e-3 if shape is box else 1e-5)  # edges of the box are kinks
+    assert shape(mesh.vertices).abs().max() < 1e-5
     x = (torch.rand(40000, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * 2
     x = x[shape(x).abs() < 0.1].requires_grad_()
     (gradient,) = torch.autograd.grad(shape(x).sum(), x)
@@ -72,7 +75,8 @@ def test_vertices_lie_on_the_surface_and_reach_all_of_it(shape):
     places, _ = trimesh.sample.sample_surface(solid(mesh), 100000, seed=0)
     reached, _ = cKDTree(places).query(exact.numpy())
     assert len(exact) > 1000
-    assert reached.max() < 0.02  # half a cell; the places are 0.006 apart
+    # Half a cell, where the places are 0.006 apart; the box's corners are cut off within theirs.
+    assert reached.max() < (0.045 if shape is box else 0.02)
 
 
 @pytest.mark.parametrize("shape", [ball, capsule, torus], ids=lambda shape: shape.__name__)
@@ -83,8 +87,8 @@ def test_normals_are_the_distances_gradients_and_those_of_triangles_close_to_the
     torch.testing.assert_close(mesh.normals, exact, atol=1e-5, rtol=0)
     cosines = (vertex_normals(mesh.vertices, mesh.faces) * exact).sum(-1).clamp(-1, 1)
     degrees = torch.rad2deg(torch.acos(cosines))
-    assert degrees.median() < 0.7
-    assert degrees.quantile(0.99) < 4
+    assert degrees.median() < 0.3
+    assert degrees.quantile(0.99) < 3
 
 
 def test_colour_is_that_seen_from_outside():
@@ -92,17 +96,11 @@ def test_colour_is_that_seen_from_outside():
     torch.testing.assert_close(mesh.rgb, 0.5 + 0.5 * (mesh.vertices - CENTER) / 0.5, atol=1e-5, rtol=0)
 
 
-def test_a_density_is_found_at_its_level_however_steeply_it_falls():
+def test_a_density_is_found_at_its_level_and_at_the_default_one_however_steeply_it_falls():
     mesh = extract(Fog(ball, level=30.0, steepness=60.0), level=30.0, resolution=24)  # by 150 from cell to cell
     assert ball(mesh.vertices).abs().max() < 1e-4
-    lower = extract(Fog(ball), level=30.0 * math.exp(-0.6), resolution=24)
-    torch.testing.assert_close(ball(lower.vertices), torch.full((len(lower.vertices),), 0.01), atol=1e-4, rtol=0)
-
-
-def test_half_the_light_is_absorbed_at_the_default_level_whatever_the_lattice():
-    level = math.log(2) / (0.01 * 2.0)
-    for resolution in (24, 32):
-        mesh = extract(Fog(ball, level=level), resolution=resolution)
+    for resolution in (24, 32):  # half the light within a hundredth of the box's side, whatever the lattice
+        mesh = extract(Fog(ball, level=math.log(2) / (0.01 * 2.0)), resolution=resolution)
         assert ball(mesh.vertices).abs().max() < 1e-4
 
 
@@ -127,7 +125,7 @@ def test_the_surface_is_that_of_its_time():
 def hollow(x, hole=0.0):
     """A ball with a cavity, and a hole of that radius into it."""
     shell = torch.maximum(ball(x), 0.35 - (x - CENTER).norm(dim=-1))
-    drill = torch.maximum(hole - (x - CENTER)[..., :2].norm(dim=-1), CENTER[2] - x[..., 2])
+    drill = torch.minimum(hole - (x - CENTER)[..., :2].norm(dim=-1), x[..., 2] - CENTER[2])
     return torch.maximum(shell, drill) if hole else shell
 
 
@@ -154,7 +152,7 @@ REFUSED = [
     (ExactSurface(lambda x: 1 + ball(x)), {}, r"mesh is empty: no distance of 0 at time 0 .* nearest is 0\.5"),
     (Fog(ball, level=1e-3, steepness=0.0), {}, r"mesh is empty: no density of 34\.66 .* nearest is 0\.001"),
     (Fog(ball), {"level": 0.0}, "level must be > 0"),
-    (ExactSurface(ball), {"resolution": 100_000}, "fits into memory: one of 100003 x 90003 x 80003 points"),
+    (ExactSurface(ball), {"resolution": 100_000}, "fits into memory: one of 100003 x 90003 x 8000[34] points"),
     (ExactSurface(ball), {"resolution": 0}, "resolution must be > 0"),
     (ExactSurface(ball), {"min_share": 2.0}, r"min_share must be in \[0, 1\], got 2.0"),
     (ExactSurface(ball), {"close_gaps": -1.0}, r"close_gaps must be in \[0, 1\], got -1.0"),

@@ -328,6 +328,10 @@ WRONG = [
     ("tracks", ("run=run", "every=1.5"), "every must be a whole number of at least 1, got 1.5"),
     ("tracks", ("run=run", "output=x.gif"), "must be a file that ends in .mp4, got x.gif"),
     ("tracks", ("run=run", "format=gif", "fps=1000"), "fps must be at most 50 for gif"),
+    ("mesh", ("run=run",), "the mesh is empty: no density of"),
+    ("mesh", ("run=run", "format=[glb,stl]"), "format must be one of glb, ply, obj; got 'stl'"),
+    ("mesh", ("run=run", "time=2"), r"time must be in \[0, 1\], got 2"),
+    ("mesh", ("run=run", "resolution=100000"), "fits into memory"),
     ("evaluate", ("runs=[run,nowhere]",), "nowhere"),
     ("evaluate", ("run=run", "lpips.enabled=true"), "lpips"),
     ("report", ("run=nowhere",), "nowhere"),
@@ -339,6 +343,16 @@ WRONG = [
 def test_wrong_input_is_named(work, script, arguments, named):
     with pytest.raises((ValueError, OSError, HydraException, OmegaConfBaseException), match=named):
         call(script, *arguments)
+
+
+def test_the_surface_of_a_run_is_written(work, capsys):
+    call("mesh", "run=run", "format=[glb,ply,obj]", "num_frames=3", "resolution=12", "level=5")
+    names = sorted(path.name for path in (work / "run" / "meshes").rglob("*.*"))
+    frames = [f"mesh_{i:05d}" for i in range(3)]
+    assert names == sorted(["mesh.glb", *(f"{frame}.{format}" for frame in frames for format in ("ply", "obj"))])
+    said = capsys.readouterr().out
+    assert "3 frames; 0 vertices left out" in said
+    assert "the canonical field changes with time: shape and colours are those of time 0.5" in said
 
 
 def test_what_is_refused_leaves_nothing(work):
