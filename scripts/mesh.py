@@ -1,7 +1,4 @@
-"""A run's surface as meshes, in the data set's units: python scripts/mesh.py run=runs/mutant num_frames=100
-
-Writes one animated glTF (mesh.glb), or a PLY or OBJ file for each frame.
-"""
+"""A run's surface as an animated glTF, or a PLY or OBJ file for each frame: python scripts/mesh.py run=runs/mutant"""
 
 import time
 from pathlib import Path
@@ -33,12 +30,12 @@ def main(config: DictConfig) -> None:
             min_share=config.min_share, close_gaps=config.close_gaps,
         )  # fmt: skip
 
-    times = torch.linspace(*scene.times, config.num_frames)
+    count = config.num_frames
+    times = torch.linspace(*scene.times, count) if count > 1 else torch.tensor([start])
     moving = mesh_through_time(renderer.field, times, extract, start=start)
     if moving is None and "glb" in formats:
         raise ValueError(
-            "format must be ply or obj: this run's field changes without a deformation, so each frame has triangles of "
-            "its own, which glTF cannot animate"
+            "format must be ply or obj: without a deformation each frame has its own triangles, no animation"
         )
     if moving is not None:
         print(moving.summary())
