@@ -17,8 +17,7 @@ def check_shape(name: str, value: Tensor, shape: Sequence[int | str]) -> None:
 
 def check_batch(name: str, value: Tensor, positions: Tensor) -> None:
     """Raise unless `value` has the batch shape of `positions` (..., 3), as times must."""
-    if value.shape != positions.shape[:-1]:
-        raise ValueError(f"{name} must have shape {tuple(positions.shape[:-1])}, got {tuple(value.shape)}")
+    check_shape(name, value, positions.shape[:-1])
 
 
 def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:
@@ -35,6 +34,17 @@ def check_whole(name: str, value: float, *, allow_zero: bool = False) -> None:
     check_positive(name, value, allow_zero=allow_zero)
     if isinstance(value, bool) or int(value) != value:
         raise ValueError(f"{name} must be a whole number, got {value}")
+
+
+def check_within(name: str, value: float | None, interval: str, *, or_none: bool = False) -> None:
+    """Raise unless a number is in an interval, given as in mathematics ("(0, 1]"), or None where allowed."""
+    low, high = map(float, interval[1:-1].split(","))
+    if not (value is None and or_none) and not (
+        value is not None
+        and (low <= value if interval[0] == "[" else low < value)
+        and (value <= high if interval[-1] == "]" else value < high)
+    ):
+        raise ValueError(f"{name} must be in {interval}{' or None' if or_none else ''}, got {value}")
 
 
 def check_mapping(name: str, values: object, *, allow_zero: bool = False) -> None:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive
+from dnerf.core.geometry import cubes
 from dnerf.deformations.base import (
     Deformation,
     PerFrame,
@@ -43,9 +44,8 @@ class CachedDeformation(WrappedDeformation, PerFrame):
         super().__init__(deformation)
         check_positive("resolution", resolution)
         corners = as_box(box)
-        sides = corners[1] - corners[0]
         self.box = nn.Buffer(corners, persistent=False)  # which follows the deformation's precision
-        self.cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
+        self.cells = cubes(corners, resolution)
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Canonical positions (..., 3) of positions (..., 3) at times (...,), exactly."""
@@ -93,7 +93,7 @@ class CachedAtTime(Deformation):
         self.pad_to = pad_to
         self.faces = list(faces)
         num_vertices = math.prod(len(x) for x in self.faces)
-        self.levels = GridLevels([[len(x) - 1 for x in self.faces]], 1 << (num_vertices - 1).bit_length())
+        self.levels = GridLevels.dense([[len(x) - 1 for x in self.faces]])
         self.low = torch.stack([x[0] for x in self.faces])
         self.sides = torch.stack([x[-1] for x in self.faces]) - self.low
         self.displacements = torch.full((num_vertices, 4), torch.nan)  # four, so that rows are aligned
