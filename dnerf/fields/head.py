@@ -127,13 +127,17 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
 
     def _linear(self, positions: Tensor, times: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """What a linear layer makes of what the head's last one sees."""
+        return nn.functional.linear(self._seen(positions, times), weight, bias)
+
+    def _seen(self, positions: Tensor, times: Tensor) -> Tensor:
+        """What the head's last layer sees (..., n)."""
         inputs = [self._features(positions, times)]
         if self.encode_times is not None:
             inputs.append(self.encode_times(times[..., None]))
         if self.space_time is not None:
             inputs.append(self.space_time(positions, times))
         joined = torch.cat(inputs, dim=-1) if len(inputs) > 1 else inputs[0]
-        return nn.functional.linear(self.head.before_output(joined, self._input_scale), weight, bias)
+        return self.head.before_output(joined, self._input_scale)
 
     def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
         """The head's outputs."""

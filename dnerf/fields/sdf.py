@@ -73,7 +73,7 @@ class SDFField(GridField, SignedDistance):
 
     def _linear(self, positions: Tensor, times: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """In full precision: surfaces are thinner than what bfloat16 tells apart."""
-        seen = self.head.before_output(*self._inputs(positions, times))
+        seen = self._seen(positions, times)
         with torch.autocast(positions.device.type, enabled=False):
             return nn.functional.linear(seen.to(weight.dtype), weight, bias)
 
