@@ -127,7 +127,10 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
 
     def _linear(self, positions: Tensor, times: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """What a linear layer makes of what the head's last one sees."""
-        return nn.functional.linear(self._seen(positions, times), weight, bias)
+        return self._last_layer(self._seen(positions, times), weight, bias)
+
+    def _last_layer(self, seen: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        return nn.functional.linear(seen, weight, bias)
 
     def _seen(self, positions: Tensor, times: Tensor) -> Tensor:
         """What the head's last layer sees (..., n)."""

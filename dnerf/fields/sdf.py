@@ -71,11 +71,10 @@ class SDFField(GridField, SignedDistance):
         """Itself."""
         return self
 
-    def _linear(self, positions: Tensor, times: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    def _last_layer(self, seen: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """In full precision: surfaces are thinner than what bfloat16 tells apart."""
-        seen = self._seen(positions, times)
-        with torch.autocast(positions.device.type, enabled=False):
-            return nn.functional.linear(seen.to(weight.dtype), weight, bias)
+        with torch.autocast(seen.device.type, enabled=False):
+            return super()._last_layer(seen.to(weight.dtype), weight, bias)
 
     def _distance(self, positions: Tensor, raw: Tensor) -> Tensor:
         """Distance (...,) of the head's first output (...,)."""
