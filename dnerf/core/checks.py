@@ -37,6 +37,17 @@ def check_whole(name: str, value: float, *, allow_zero: bool = False) -> None:
         raise ValueError(f"{name} must be a whole number, got {value}")
 
 
+def check_within(name: str, value: float | None, interval: str, *, or_none: bool = False) -> None:
+    """Raise unless a number is in an interval, given as in mathematics ("(0, 1]"), or None where allowed."""
+    low, high = map(float, interval[1:-1].split(","))
+    if not (value is None and or_none) and not (
+        value is not None
+        and (low <= value if interval[0] == "[" else low < value)
+        and (value <= high if interval[-1] == "]" else value < high)
+    ):
+        raise ValueError(f"{name} must be in {interval}{' or None' if or_none else ''}, got {value}")
+
+
 def check_mapping(name: str, values: object, *, allow_zero: bool = False) -> None:
     """Raise unless `values` holds positive (or, where allowed, zero) finite numbers by name."""
     if not isinstance(values, Mapping):

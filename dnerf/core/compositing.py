@@ -57,7 +57,8 @@ class Rendering:
         return torch.where(self.is_placed, values, 0).sum() / self.is_placed.sum().clamp(min=1)
 
 
-def _at_least_float32(values: Tensor) -> Tensor:
+def at_least_float32(values: Tensor) -> Tensor:
+    """Half precision raised to float32."""
     return values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
 
 
@@ -75,7 +76,7 @@ def render_weights(optical_depth: Tensor, samples: Samples) -> Tensor:
         ValueError: if the layout is not that of the samples.
     """
     check_shape("optical_depth", optical_depth, samples.starts.shape)
-    depth = _at_least_float32(optical_depth)
+    depth = at_least_float32(optical_depth)
     if samples.is_packed:
         return packed_weights(depth, samples.offsets)
     before = torch.cumsum(depth[:, :-1], dim=-1)
@@ -101,7 +102,7 @@ def sum_along_rays(values: Tensor, samples: Samples, weights: Tensor | None = No
     if leading != samples.starts.shape:
         expected = ", ".join(str(size) for size in (*samples.starts.shape, "..."))
         raise ValueError(f"values must have shape ({expected}), got {tuple(values.shape)}")
-    values = _at_least_float32(values)
+    values = at_least_float32(values)
     if weights is not None:
         check_shape("weights", weights, samples.starts.shape)
     if samples.is_packed:
@@ -144,13 +145,13 @@ def composite(
     check_shape("density", output.density, samples.starts.shape)
     check_shape("rgb", output.rgb, (*samples.starts.shape, 3))
     density = torch.full_like(output.density, OPAQUE) if samples.is_opaque else output.density
-    depths, shares = optical_depths(_at_least_float32(density), samples, quadrature)
+    depths, shares = optical_depths(at_least_float32(density), samples, quadrature)
     weights = render_weights(depths, samples)
     if shares is not None:
         weights = spread_weights(weights, shares, samples)
     columns = torch.cat(
         [
-            _at_least_float32(output.rgb).to(weights.dtype),
+            at_least_float32(output.rgb).to(weights.dtype),
             samples.distances[..., None].to(weights.dtype),
             torch.ones_like(weights)[..., None],
         ],

@@ -145,6 +145,17 @@ def cube_corners(device: torch.device) -> Tensor:
     return torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
 
 
+def cubes(box: Tensor, resolution: int) -> list[int]:
+    """How many cells a box (2, 3) has on each axis, if they are nearly cubes and so many lie along its longest side."""
+    sides = box[1] - box[0]
+    return [max(1, round(resolution * float(side / sides.max()))) for side in sides]
+
+
+def in_unit_cube(positions: Tensor, low: Tensor, scale: Tensor) -> Tensor:
+    """Places (N, 3) of positions (..., 3) in a box, whose corners are 0 and 1, by its low one and 1 / its sides."""
+    return (positions - low.to(positions.dtype)).mul_(scale.to(positions.dtype)).reshape(-1, 3)
+
+
 def box_planes(poses: Tensor, box: Sequence[Sequence[float]] | Tensor) -> list[tuple[float, float]]:
     """Near and far z-depths between which cameras (F, 4, 4) have a whole box (2, 3): F pairs 0 <= near < far.
 

@@ -46,11 +46,6 @@ class Shares:
     after: Tensor
 
 
-def check_rule(quadrature: str) -> None:
-    """Raise ValueError unless the rule is known."""
-    check_choice("quadrature", quadrature, RULES)
-
-
 def optical_depths(density: Tensor, samples: Samples, quadrature: str = "constant") -> tuple[Tensor, Shares | None]:
     """Optical depth of every interval, and whose colour its light has.
 
@@ -65,7 +60,7 @@ def optical_depths(density: Tensor, samples: Samples, quadrature: str = "constan
     Raises:
         ValueError: for another rule or layout.
     """
-    check_rule(quadrature)
+    check_choice("quadrature", quadrature, RULES)
     check_shape("density", density, samples.starts.shape)
     if quadrature == "constant":
         return interval_depths(density, samples.lengths), None

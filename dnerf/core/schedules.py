@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 
-from dnerf.core.checks import check_choice, check_positive
+from dnerf.core.checks import check_choice, check_positive, check_within
 
 KINDS = ("linear", "exponential")
 
@@ -61,8 +61,7 @@ class Fade(Ramp):
     """
 
     def __init__(self, start: float, share: float = 0.03, begin: float = 0.3, end: float = 0.7) -> None:
-        if not 0 < share <= 1:
-            raise ValueError(f"share must be in (0, 1], got {share}")
+        check_within("share", share, "(0, 1]")
         super().__init__(start, share * start, begin, end, kind="exponential")
 
 

@@ -10,11 +10,6 @@ from dnerf.core.checks import check_choice, check_shape
 DEGREES = (0, 1, 2, 3, 4)
 
 
-def check_degree(name: str, degree: int) -> None:
-    """Raise unless there are spherical harmonics here up to a degree."""
-    check_choice(name, degree, DEGREES)
-
-
 def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     """All real spherical harmonics up to a degree, of mean square one over the sphere: the first one is one.
 
@@ -31,7 +26,7 @@ def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     Raises:
         ValueError: for another degree or a shape that does not fit.
     """
-    check_degree("degree", degree)
+    check_choice("degree", degree, DEGREES)
     check_shape("directions", directions, (*directions.shape[:-1], 3))
     x, y, z = directions.unbind(-1)
     terms = [torch.ones_like(x)]

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive
+from dnerf.core.geometry import cubes
 from dnerf.deformations.base import (
     Deformation,
     PerFrame,
@@ -43,9 +44,8 @@ class CachedDeformation(WrappedDeformation, PerFrame):
         super().__init__(deformation)
         check_positive("resolution", resolution)
         corners = as_box(box)
-        sides = corners[1] - corners[0]
         self.box = nn.Buffer(corners, persistent=False)  # which follows the deformation's precision
-        self.cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
+        self.cells = cubes(corners, resolution)
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Canonical positions (..., 3) of positions (..., 3) at times (...,), exactly."""

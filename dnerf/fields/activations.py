@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from dnerf.core.checks import check_choice
+from dnerf.core.compositing import at_least_float32
 
 DENSITY_ACTIVATIONS = ("softplus", "exp")
 
@@ -41,5 +42,5 @@ def activate_density(raw: Tensor, activation: str, shift: float) -> Tensor:
         ValueError: for another activation.
     """
     check_choice("activation", activation, DENSITY_ACTIVATIONS)
-    raw = (raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw) + shift
+    raw = at_least_float32(raw) + shift
     return softplus(raw) if activation == "softplus" else truncated_exp(raw)

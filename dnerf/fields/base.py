@@ -141,8 +141,8 @@ def interval_aware(field: RadianceField) -> IntervalAware | None:
     return field if field.knows_intervals else None
 
 
-def surface_of(field: RadianceField) -> SignedDistance | None:
-    """The field as one that has a surface, if it has one."""
+def surface_of(field: nn.Module) -> SignedDistance | None:
+    """The field, or part of one, as what has a surface, if it has one."""
     return field if isinstance(field, SignedDistance) and field.has_surface else None
 
 

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive, check_shape, check_whole
-from dnerf.core.compositing import FieldOutput
+from dnerf.core.compositing import FieldOutput, at_least_float32
+from dnerf.core.geometry import cubes, in_unit_cube
 from dnerf.core.spherical_harmonics import spherical_harmonics
 from dnerf.deformations.base import check_one_time, check_positions_times
 from dnerf.fields.base import NetworkTabled, NetworkTables, RadianceField, warn_of_generic_path
@@ -42,9 +43,7 @@ class GridField(HeadedField):
         for resolution in resolutions:
             check_whole("resolutions", resolution)
         corners = as_box(box)
-        sides = corners[1] - corners[0]
-        cells = [[max(1, round(r * float(s / sides.max()))) for s in sides] for r in resolutions]
-        levels = GridLevels(cells, max_rows)
+        levels = GridLevels([cubes(corners, r) for r in resolutions], max_rows)
         table = torch.empty(levels.num_rows, num_features).uniform_(-1e-2, 1e-2)
         super().__init__(
             levels.num_levels, num_features, hidden_features=hidden_features, num_layers=num_layers,
@@ -54,12 +53,12 @@ class GridField(HeadedField):
         )  # fmt: skip
         self.levels = levels
         self.low = nn.Buffer(corners[0], persistent=False)
-        self.scale = nn.Buffer(1 / sides, persistent=False)
+        self.scale = nn.Buffer(1 / (corners[1] - corners[0]), persistent=False)
         self.table = nn.Parameter(table)
 
     def _unit(self, positions: Tensor) -> Tensor:
         """Places (N, 3) in the box, whose corners are 0 and 1."""
-        return (positions - self.low.to(positions.dtype)).mul_(self.scale.to(positions.dtype)).reshape(-1, 3)
+        return in_unit_cube(positions, self.low, self.scale)
 
     def _features(self, positions: Tensor, times: Tensor) -> Tensor:
         features = grid_encode(self._unit(positions), self.table, self.levels, rounded=is_bfloat16_wanted(positions))
@@ -79,13 +78,10 @@ class GridField(HeadedField):
         time () what they see of it is part of the first biases."""
         if self.space_time is not None or (self.encode_times is not None and time is None):
             return None
-        if self.encode_times is None or time is None:
-            return self.head.relu_parameters(self._feature_scale)
-        encoded, scale = self.encode_times(time[None]), self._feature_scale
-        scale = None if scale is None else nn.functional.pad(scale, (0, len(encoded)), value=1)
-        layers = self.head.relu_parameters(scale)
-        if layers is None:
-            return None
+        layers = self.head.relu_parameters(self._input_scale)
+        if layers is None or self.encode_times is None or time is None:
+            return layers
+        encoded = self.encode_times(time[None])
         (first, *weights), (bias, *biases) = layers
         of_table, of_time = first.tensor_split([first.shape[1] - len(encoded)], dim=1)
         return [of_table, *weights], [bias + of_time @ encoded, *biases]
@@ -164,6 +160,6 @@ class GridFieldAtTime(RadianceField, NetworkTabled):
             basis = spherical_harmonics(directions.reshape(-1, 3), degree)
             values, after = series_sums(values + after, basis), after.new_zeros(4)
         if not is_exponential:
-            return self.field._activated_values(values.reshape(*times.shape, 4))
+            return self.field._activated_values(at_least_float32(values.reshape(*times.shape, 4)))
         density, rgb = shade(values, after, self.field.density_shift)
         return FieldOutput(density.reshape(times.shape), rgb.reshape(positions.shape))

@@ -6,10 +6,10 @@ from abc import abstractmethod
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import check_positive, check_shape
-from dnerf.core.compositing import FieldOutput
+from dnerf.core.checks import check_choice, check_positive, check_shape, check_within
+from dnerf.core.compositing import FieldOutput, at_least_float32
 from dnerf.core.schedules import Scheduled
-from dnerf.core.spherical_harmonics import check_degree, spherical_harmonics
+from dnerf.core.spherical_harmonics import DEGREES, spherical_harmonics
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField, TimeDependence
@@ -17,8 +17,7 @@ from dnerf.fields.space_time import SpaceTimeFeatures
 from dnerf.kernels import series_sums
 from dnerf.nn.encodings import SinusoidalEncoding
 from dnerf.nn.mlp import MLP
-from dnerf.nn.output_labels import HasOutputLabels
-from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
+from dnerf.nn.parameter_groups import DeclaresGroups, HasOutputLabels, ParameterGroup
 
 # Of harmonics beside the constant, which stays one: this makes them orthonormal. All coefficients take steps of one
 # size, and a colour's dependence on direction is best found more slowly than the colour.
@@ -63,9 +62,8 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
     ) -> None:  # fmt: skip
         super().__init__()
         check_positive("temporal_terms", temporal_terms)
-        check_degree("view_degree", view_degree or 0)
-        if window_end is not None and not 0 < window_end <= 1:
-            raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
+        check_choice("view_degree", view_degree or 0, DEGREES)
+        check_within("window_end", window_end, "(0, 1]", or_none=True)
         self.num_features = num_features
         self.density_activation = density_activation
         self.density_shift = density_shift
@@ -120,30 +118,26 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
 
     def set_progress(self, progress: float) -> None:
         """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
-        if self.window_end is None:
-            return
-        levels = torch.arange(len(self.window), device=self.window.device)
-        opened = (len(levels) - 1) * min(progress / self.window_end, 1.0) - levels + 1
-        self.window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))
+        if self.window_end is not None:
+            open_levels(self.window, progress / self.window_end)
 
     @property
-    def _feature_scale(self) -> Tensor | None:
-        """Of each feature; None for 1."""
-        return None if self.window_end is None else self.window.repeat_interleave(self.num_features)
-
-    def _inputs(self, positions: Tensor, times: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What the head sees (..., n), and the scale (n,) of each column."""
-        features, scale = self._features(positions, times), self._feature_scale
-        if self.encode_times is not None:
-            features, scale = _joined(features, scale, self.encode_times(times[..., None]))
-        if self.space_time is not None:
-            features, scale = _joined(features, scale, self.space_time(positions, times))
-        return features, scale
+    def _input_scale(self) -> Tensor | None:
+        """Of each column (n,) that the head sees: the window's of features; None for 1."""
+        if self.window_end is None:
+            return None
+        scale = self.window.repeat_interleave(self.num_features)
+        return nn.functional.pad(scale, (0, self.head.in_features - len(scale)), value=1)
 
     def _linear(self, positions: Tensor, times: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """What a linear layer makes of what the head's last one sees."""
-        seen = self.head.before_output(*self._inputs(positions, times))
-        return nn.functional.linear(seen, weight, bias)
+        inputs = [self._features(positions, times)]
+        if self.encode_times is not None:
+            inputs.append(self.encode_times(times[..., None]))
+        if self.space_time is not None:
+            inputs.append(self.space_time(positions, times))
+        joined = torch.cat(inputs, dim=-1) if len(inputs) > 1 else inputs[0]
+        return nn.functional.linear(self.head.before_output(joined, self._input_scale), weight, bias)
 
     def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
         """The head's outputs."""
@@ -174,10 +168,22 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         """The series' cosines (..., K) at times (...,)."""
         return torch.cos(math.pi * self.orders.to(times.dtype) * times[..., None])
 
-    def _values(self, raw: Tensor, directions: Tensor, times: Tensor) -> Tensor:
-        """Density and colour (..., 4), before their activations, of the head's outputs."""
+    def _density_series(self, positions: Tensor, times: Tensor) -> Tensor:
+        """What the head says of density alone (..., K)."""
+        check_positions_times(positions, times)
         if not self.view_degree:
-            return self._at(raw, times)
+            return self._raw(positions, times)[..., : self.temporal_terms]
+        # Colours have many terms.
+        return self._linear(positions, times, *(self._series(part)[0] for part in self._last))
+
+    def _values(self, positions: Tensor, directions: Tensor, times: Tensor) -> Tensor:
+        """Density and colour (..., 4), before their activations, in float32 at least."""
+        check_positions_times(positions, times)
+        if self.view_degree:
+            check_shape("directions", directions, positions.shape)
+        raw = self._raw(positions, times)
+        if not self.view_degree:
+            return at_least_float32(self._at(raw, times))
         with torch.autocast(raw.device.type, enabled=False):
             harmonics = spherical_harmonics(directions, self.view_degree)[..., 1:] * VIEW_SCALE
             basis = torch.cat([self._waves(times), harmonics], dim=-1)
@@ -193,28 +199,19 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         return torch.cat([summed[:1], harmonics.flatten(0, 1)])
 
     def _activated_values(self, values: Tensor) -> FieldOutput:
-        values = values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
         # Of all columns, then without the first: what lies in one row is several times quicker.
         return FieldOutput(density=self._activated(values[..., 0]), rgb=torch.sigmoid(values)[..., 1:])
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""
-        check_positions_times(positions, times)
-        if not self.view_degree:
-            raw = self._raw(positions, times)[..., : self.temporal_terms]
-        else:  # colours have many terms
-            raw = self._linear(positions, times, *(self._series(part)[0] for part in self._last))
-        return self._activated(self._at(raw, times)[..., 0])
+        return self._activated(self._at(self._density_series(positions, times), times)[..., 0])
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3), directions (..., 3) and times (...,)."""
-        check_positions_times(positions, times)
-        if self.view_degree:
-            check_shape("directions", directions, positions.shape)
-        return self._activated_values(self._values(self._raw(positions, times), directions, times))
+        return self._activated_values(self._values(positions, directions, times))
 
 
-def _joined(features: Tensor, scale: Tensor | None, more: Tensor) -> tuple[Tensor, Tensor | None]:
-    """More columns (..., m), of scale 1, behind others."""
-    scale = None if scale is None else nn.functional.pad(scale, (0, more.shape[-1]), value=1)
-    return torch.cat([features, more], dim=-1), scale
+def open_levels(window: Tensor, share: float) -> None:
+    """Set what levels (L,) count for to where a share of a window's time is over: from coarse to fine, one is open."""
+    opened = (len(window) - 1) * min(share, 1.0) - torch.arange(len(window), device=window.device) + 1
+    window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))

@@ -35,6 +35,8 @@ class NeRFField(RadianceField, TimeDependence):
         ValueError: for sizes that are not positive, or skips that name no layer.
     """
 
+    is_static = True
+
     def __init__(
         self, num_layers: int = 8, hidden_features: int = 256, skips: Sequence[int] = (5,), *,
         position_frequencies: int = 10, view_dependent: bool = False, direction_frequencies: int = 4,
@@ -58,11 +60,6 @@ class NeRFField(RadianceField, TimeDependence):
 
     def _density(self, features: Tensor) -> Tensor:
         return activate_density(self.to_density(features)[..., 0], self.density_activation, self.density_shift)
-
-    @property
-    def is_static(self) -> bool:
-        """Always: times are not used."""
-        return True
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3); times (...,) are not used."""

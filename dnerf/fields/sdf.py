@@ -10,7 +10,6 @@ from torch.nn.functional import logsigmoid
 
 from dnerf.core.checks import check_positive, check_shape
 from dnerf.core.compositing import FieldOutput
-from dnerf.deformations.base import check_positions_times
 from dnerf.fields.base import IntervalAware, RadianceField, SignedDistance, ends_of
 from dnerf.fields.grid import GridField
 
@@ -78,11 +77,7 @@ class SDFField(GridField, SignedDistance):
 
     def _values_at(self, positions: Tensor, directions: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (...,), and colour (..., 3) before its activation."""
-        check_positions_times(positions, times)
-        if self.view_degree:
-            check_shape("directions", directions, positions.shape)
-        values = self._values(self._raw(positions, times), directions, times)
-        values = values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
+        values = self._values(positions, directions, times)
         return self._distance(positions, values[..., 0]), values[..., 1:]
 
     @abstractmethod
@@ -91,12 +86,7 @@ class SDFField(GridField, SignedDistance):
 
     def distance(self, positions: Tensor, times: Tensor) -> Tensor:
         """Signed distance (...,), negative inside, at canonical positions (..., 3)."""
-        check_positions_times(positions, times)
-        if not self.view_degree:
-            raw = self._raw(positions, times)
-        else:  # colours have many terms
-            raw = self._linear(positions, times, *(part[:1] for part in self._last))
-        return self._distance(positions, raw[..., 0])
+        return self._distance(positions, self._density_series(positions, times)[..., 0])
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,), head-on, at canonical positions (..., 3)."""

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive, check_whole
+from dnerf.core.geometry import cubes, in_unit_cube
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.base import HasRoughness
 from dnerf.kernels import GridLevels, grid_encode
@@ -51,25 +52,24 @@ class LatticeFeatures(SpaceTimeFeatures, HasRoughness):
             for number in numbers:
                 check_whole(name, number)
         corners = as_box(box)
-        sides = corners[1] - corners[0]
-        shares = (sides / sides.max()).tolist()
-        cells = [[*(max(1, round(r * x)) for x in shares), t] for r, t in zip(resolutions, time_resolutions)]
+        cells = [[*cubes(corners, r), t] for r, t in zip(resolutions, time_resolutions)]
         self.axes = tuple(tuple(some) for some in axes)
-        self.levels = tuple(_dense([[*(level[k] for k in some), 0][:3] for level in cells]) for some in self.axes)
+        self.levels = tuple(
+            GridLevels.dense([[*(level[k] for k in some), 0][:3] for level in cells]) for some in self.axes
+        )
         self.tables = nn.ParameterList(
             nn.Parameter(torch.empty(levels.num_rows, num_features).uniform_(-1e-2, 1e-2)) for levels in self.levels
         )
         self.low = nn.Buffer(corners[0], persistent=False)
-        self.scale = nn.Buffer(1 / sides, persistent=False)
+        self.scale = nn.Buffer(1 / (corners[1] - corners[0]), persistent=False)
         self.num_levels = len(resolutions)
         self.out_features = self.num_levels * num_features
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
         """Features (..., L F), level by level, at positions (..., 3) and times (...,) in [0, 1]."""
         check_positions_times(positions, times)
-        dtype = positions.dtype
-        unit = ((positions - self.low.to(dtype)) * self.scale.to(dtype)).reshape(-1, 3)
-        columns = [*unit.unbind(-1), times.to(dtype).reshape(-1)]
+        unit = in_unit_cube(positions, self.low, self.scale)
+        columns = [*unit.unbind(-1), times.to(positions.dtype).reshape(-1)]
         values = [
             # A plane's third column counts for nothing.
             grid_encode(torch.stack([columns[k] for k in (*some, 0)[:3]], dim=-1), table, levels)
@@ -121,8 +121,3 @@ class SpaceTimeVolumes(LatticeFeatures):
 def _mean_square(values: Tensor) -> Tensor:
     """0 for none, as of second differences between two times."""
     return values.square().sum() / max(values.numel(), 1)
-
-
-def _dense(cells: list[list[int]]) -> GridLevels:
-    """Levels of which every vertex has a row of its own."""
-    return GridLevels(cells, 1 << (max(GridLevels(cells, 1).vertices) - 1).bit_length())

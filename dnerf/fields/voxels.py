@@ -6,14 +6,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import as_box, check_positive, check_shape, check_whole
+from dnerf.core.checks import as_box, check_choice, check_positive, check_shape, check_whole, check_within
 from dnerf.core.compositing import FieldOutput
+from dnerf.core.geometry import cubes, in_unit_cube
 from dnerf.core.schedules import Scheduled
-from dnerf.core.spherical_harmonics import check_degree, spherical_harmonics
+from dnerf.core.spherical_harmonics import DEGREES, spherical_harmonics
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import HasRoughness, RadianceField, TimeDependence
-from dnerf.fields.head import VIEW_SCALE
+from dnerf.fields.head import VIEW_SCALE, open_levels
 from dnerf.kernels import GridLevels, grid_encode
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
@@ -51,13 +52,15 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         ValueError: for a box or numbers out of range, no level with harmonics, or tables too large for `max_gib`.
     """
 
+    is_static = True
+
     def __init__(
         self, box: Sequence[Sequence[float]], resolutions: Sequence[int] = (32, 64, 128, 256), *, view_degree: int = 2,
         view_resolution: int = 64, density_activation: str = "exp", density_shift: float = -1.0,
         density_scale: float = 4.0, window_end: float | None = None, max_gib: float = 4.0,
     ) -> None:  # fmt: skip
         super().__init__()
-        check_degree("view_degree", view_degree)
+        check_choice("view_degree", view_degree, DEGREES)
         for name, value in (("view_resolution", view_resolution), *(("resolutions", r) for r in resolutions)):
             check_whole(name, value)
         check_positive("density_scale", density_scale)
@@ -68,12 +71,10 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
             raise ValueError(
                 f"view_resolution must be {resolutions[0]}, the first level's, or more, got {view_resolution}"
             )
-        if window_end is not None and not 0 < window_end <= 1:
-            raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
+        check_within("window_end", window_end, "(0, 1]", or_none=True)
         corners = as_box(box)
-        sides = corners[1] - corners[0]
-        cells = [[max(1, round(r * float(s / sides.max()))) for s in sides] for r in resolutions]
-        rows = [(x + 1) * (y + 1) * (z + 1) for x, y, z in cells]
+        cells = [cubes(corners, r) for r in resolutions]
+        rows = [math.prod(c + 1 for c in level) for level in cells]
         self.num_viewed = sum(r <= view_resolution for r in resolutions) if view_degree else 0
         self.view_degree = view_degree
         columns = 3 * ((view_degree + 1) ** 2 - 1)
@@ -83,21 +84,16 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
                 f"resolutions {list(resolutions)} need {gib:.1f} GiB in training, for weights, gradients and Adam's "
                 f"moments, of max_gib={max_gib:g}: use coarser ones, a lower view_resolution, or raise max_gib"
             )
-        self.levels = tuple(GridLevels([c], 1 << (n - 1).bit_length()) for c, n in zip(cells, rows, strict=True))
+        self.levels = tuple(GridLevels.dense([level]) for level in cells)
         self.density_activation, self.density_shift = density_activation, density_shift
         self.density_scale = density_scale
         self.window_end = window_end
         self.window = nn.Buffer(torch.ones(len(rows)), persistent=window_end is not None)
         self.num_open = len(rows)  # levels that are evaluated; the others' window is zero
         self.low = nn.Buffer(corners[0], persistent=False)
-        self.scale = nn.Buffer(1 / sides, persistent=False)
+        self.scale = nn.Buffer(1 / (corners[1] - corners[0]), persistent=False)
         self.tables = nn.ParameterList(nn.Parameter(torch.zeros(n, 4)) for n in rows)
         self.harmonics = nn.ParameterList(nn.Parameter(torch.zeros(n, columns)) for n in rows[: self.num_viewed])
-
-    @property
-    def is_static(self) -> bool:
-        """Always."""
-        return True
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """Densities and constant colours in "voxels", the other harmonics in "voxels_view"."""
@@ -107,11 +103,9 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         """Open the window to where training stands, `progress` in [0, 1]; no effect without a window."""
         if self.window_end is None:
             return
-        levels = torch.arange(len(self.window), device=self.window.device)
-        opened = (len(levels) - 1) * min(progress / self.window_end, 1.0) - levels + 1
-        self.window.copy_(0.5 * (1 - torch.cos(math.pi * opened.clamp(0, 1))))
+        open_levels(self.window, progress / self.window_end)
         if not self.window.is_cuda:  # graphs that replay steps would go on without a level that has opened since
-            self.num_open = min(len(levels), 1 + math.ceil((len(levels) - 1) * progress / self.window_end))
+            self.num_open = min(len(self.window), 1 + math.ceil((len(self.window) - 1) * progress / self.window_end))
 
     def _summed(self, unit: Tensor, tables: nn.ParameterList) -> Tensor:
         """Values (N, F) at places (N, 3) of the unit cube: of all open levels, each times its share."""
@@ -124,22 +118,19 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         assert total is not None
         return total
 
-    def _unit(self, positions: Tensor) -> Tensor:
-        """Places (N, 3) in the box, whose corners are 0 and 1."""
-        return ((positions - self.low.to(positions.dtype)) * self.scale.to(positions.dtype)).reshape(-1, 3)
-
     def _activated(self, raw: Tensor) -> Tensor:
         return activate_density(raw * self.density_scale, self.density_activation, self.density_shift)
 
     def density(self, positions: Tensor, times: Tensor) -> Tensor:
         """Density (...,) at canonical positions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
-        return self._activated(self._summed(self._unit(positions), self.tables)[:, 0]).reshape(times.shape)
+        unit = in_unit_cube(positions, self.low, self.scale)
+        return self._activated(self._summed(unit, self.tables)[:, 0]).reshape(times.shape)
 
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at canonical positions (..., 3), directions (..., 3) and times (...,)."""
         check_positions_times(positions, times)
-        unit = self._unit(positions)
+        unit = in_unit_cube(positions, self.low, self.scale)
         values = self._summed(unit, self.tables)
         density, colors = self._activated(values[:, 0]), values[:, 1:]
         if self.num_viewed:

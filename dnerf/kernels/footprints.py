@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dnerf.core.geometry import cube_corners
+from dnerf.core.rays import parts_of
 
 from .backend import choose, run_compiled
 from .checks import check_cells, check_shapes
@@ -86,8 +87,7 @@ def footprints_reference(
     )
     wide = (right - left).clamp(min=0)
     counts = wide * (bottom - top).clamp(min=0)
-    owner = torch.repeat_interleave(counts)
-    within = torch.arange(len(owner), device=pose.device) - (counts.cumsum(0) - counts)[owner]
+    owner, within = parts_of(counts)
     pixels = (top[owner] + within // wide[owner]) * width + left[owner] + within % wide[owner]
     depths = [
         depth.new_full((height * width,), unseen).scatter_reduce_(0, pixels, extreme[owner], reduction)

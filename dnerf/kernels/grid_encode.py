@@ -44,6 +44,11 @@ class GridLevels:
             raise ValueError(f"max_rows must be a power of two below 2^31, got {self.max_rows}")
         object.__setattr__(self, "resolutions", triples)
 
+    @classmethod
+    def dense(cls, resolutions: Sequence[Sequence[int]]) -> "GridLevels":
+        """Levels of which every vertex has a row of its own."""
+        return cls(resolutions, 1 << (max(cls(resolutions, 1).vertices) - 1).bit_length())
+
     @cached_property
     def cells(self) -> list[int]:
         """Cells per axis of every level, flattened: 3 L ints."""

@@ -5,6 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dnerf.core.rays import parts_of
+
 from .backend import choose
 from .checks import check_offsets, check_shape
 from .op import op
@@ -44,8 +46,7 @@ def packed_weights_reference(optical_depth: Tensor, offsets: Tensor) -> Tensor:
     if not len(optical_depth):
         return optical_depth.clone()
     counts = offsets.diff()
-    rays = torch.repeat_interleave(counts)
-    columns = torch.arange(len(optical_depth), device=offsets.device) - offsets[rays]
+    rays, columns = parts_of(counts)
     padded = optical_depth.new_zeros(len(counts), int(counts.max())).index_put((rays, columns), optical_depth)
     # Shifted rather than inclusive minus self, which is inf - inf on an opaque sample.
     before = torch.cat((torch.zeros_like(padded[:, :1]), padded.cumsum(-1)[:, :-1]), -1)

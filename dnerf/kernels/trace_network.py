@@ -140,7 +140,7 @@ def trace_network_reference(
     is_done, goes_on = (torch.ones(len(origins), dtype=torch.bool, device=near.device) for _ in range(2))
 
     shape, basis = tables.is_known.shape, spherical_harmonics(directions, tables.degree)
-    levels = GridLevels([[length - 1 for length in reversed(shape)]], 1 << (shape.numel() - 1).bit_length())
+    levels = GridLevels.dense([[length - 1 for length in reversed(shape)]])
 
     def ask(chosen: Tensor, middles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Densities and colours of chosen rays (n,) at distances, and whether they are known."""

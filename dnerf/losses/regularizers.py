@@ -207,8 +207,8 @@ class TimeEmbeddingLoss(Loss):
 
 def canonical_surface(field: RadianceField) -> SignedDistance | None:
     """What has a surface in canonical space, behind all deformations; None if nothing has."""
-    surfaces = [part for part in field.modules() if isinstance(part, RadianceField) and surface_of(part)]
-    return surface_of(surfaces[-1]) if surfaces else None  # parts come after what they are part of
+    surfaces = [surface for surface in map(surface_of, field.modules()) if surface is not None]
+    return surfaces[-1] if surfaces else None  # parts come after what they are part of
 
 
 class EikonalLoss(PlacesLoss):

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import check_positive, check_whole
+from dnerf.core.checks import check_positive, check_whole, check_within
 from dnerf.core.geometry import check_last_axis
 from dnerf.core.schedules import Scheduled
 
@@ -44,8 +44,7 @@ class SinusoidalEncoding(nn.Module, Scheduled):
         super().__init__()
         check_positive("num_dims", num_dims)
         check_positive("num_frequencies", num_frequencies, allow_zero=include_input)
-        if window_end is not None and not 0 < window_end <= 1:
-            raise ValueError(f"window_end must be in (0, 1] or None, got {window_end}")
+        check_within("window_end", window_end, "(0, 1]", or_none=True)
         self.num_dims = num_dims
         self.num_frequencies = num_frequencies
         self.include_input = include_input

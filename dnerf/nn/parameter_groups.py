@@ -1,6 +1,7 @@
-"""What modules declare of their parameters and buffers: learning-rate groups, and buffers that only training needs."""
+"""What modules declare of their parameters and buffers: learning-rate groups, meanings of rows, what training needs."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -59,6 +60,24 @@ def network_groups(network: nn.Module, name: str, output: nn.Module | None = Non
         ParameterGroup(name, tuple(rest)),
         ParameterGroup(f"{name}_output", tuple(last)),
     ]
+
+
+class HasOutputLabels(ABC):
+    """A module some of whose parameters have rows that mean something by themselves: other models may take them."""
+
+    @abstractmethod
+    def output_labels(self) -> Mapping[str, Sequence[str]]:
+        """Labels of the rows of its own or its children's parameters, by the parameter's name."""
+
+
+def labels_of(model: nn.Module) -> dict[str, Sequence[str]]:
+    """Labels of rows by the parameter's name in the whole model."""
+    return {
+        f"{prefix}.{name}" if prefix else name: labels
+        for prefix, module in model.named_modules()
+        if isinstance(module, HasOutputLabels)
+        for name, labels in module.output_labels().items()
+    }
 
 
 class HasTrainingBuffers(ABC):

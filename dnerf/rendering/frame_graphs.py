@@ -37,9 +37,6 @@ class FrameGraphs:
         self._cache.forget()
         self._sizes.clear()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "FrameGraphs":
-        return FrameGraphs(self.device)
-
     def __reduce__(self) -> tuple[type, tuple[torch.device]]:
         return FrameGraphs, (self.device,)
 

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from dnerf.core.backgrounds import Background, ConstantBackground
 from dnerf.core.cameras import Camera
-from dnerf.core.checks import check_choice, check_positive
+from dnerf.core.checks import check_choice, check_positive, check_within
 from dnerf.core.compositing import Rendering, composite, over
-from dnerf.core.quadrature import check_rule
+from dnerf.core.quadrature import RULES
 from dnerf.core.rays import Rays, Samples
 from dnerf.core.schedules import Scheduled
 from dnerf.core.shortcuts import speaks_for
@@ -60,9 +60,8 @@ class Renderer(nn.Module):
         exposure: Exposure | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
-        if not 0 <= stop_transmittance < 1:
-            raise ValueError(f"stop_transmittance must be in [0, 1), got {stop_transmittance}")
-        check_rule(quadrature)
+        check_within("stop_transmittance", stop_transmittance, "[0, 1)")
+        check_choice("quadrature", quadrature, RULES)
         check_choice("precision", precision, tuple(PRECISIONS))
         if graphs and not has_fixed_capacity(sampler):
             raise ValueError(f"graphs needs a sampler with a fixed capacity, got {type(sampler).__name__}")
@@ -121,7 +120,7 @@ class Renderer(nn.Module):
             self._exposed(composite(placed, said, background, quadrature=self.quadrature), rays)
             for placed, said in samples.proposals
         )
-        return Rendering(**{**vars(rendering), "proposals": proposals})
+        return replace(rendering, proposals=proposals)
 
     def _exposed(self, rendering: Rendering, rays: Rays) -> Rendering:
         if self.exposure is None or not self.training:
@@ -191,8 +190,7 @@ class Renderer(nn.Module):
             MemoryError: if a GPU's memory does not suffice for one ray; until then the chunk is halved.
         """
         check_positive("chunk", chunk)
-        if not 0 <= time <= 1:
-            raise ValueError(f"time must be in [0, 1], got {time}")
+        check_within("time", time, "[0, 1]")
         dtype = next((p.dtype for p in self.parameters() if p.is_floating_point()), camera.pose.dtype)
         if camera.pose.dtype != dtype:
             camera = replace(camera, pose=camera.pose.to(dtype))

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.cameras import Camera
-from dnerf.core.checks import check_positive, check_whole
+from dnerf.core.checks import check_positive, check_whole, check_within
 from dnerf.core.compositing import FieldOutput, render_weights
 from dnerf.core.fixed_size import placed
 from dnerf.core.quadrature import interval_depths
@@ -68,11 +68,9 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         ):  # fmt: skip
             check_whole(name, count)
         for name, value in (("subdivision_weight", subdivision_weight), ("min_weight", min_weight)):
-            if not 0 <= value < 1:
-                raise ValueError(f"{name} must be in [0, 1), got {value}")
+            check_within(name, value, "[0, 1)")
         for name, value in (("subdivide_from", subdivide_from), ("narrow_from", narrow_from)):
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {value}")
+            check_within(name, value, "[0, 1]")
         for progress in (0.0, 1.0):
             check_positive("step_size", at(step_size, progress))
         self.grid = grid

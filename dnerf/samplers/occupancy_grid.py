@@ -6,7 +6,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import as_box, check_positive
+from dnerf.core.checks import as_box, check_positive, check_within
+from dnerf.core.geometry import cubes
 from dnerf.fields.base import RadianceField
 from dnerf.kernels import skip_distances
 from dnerf.nn.parameter_groups import HasTrainingBuffers
@@ -59,14 +60,12 @@ class OccupancyGrid(nn.Module, HasTrainingBuffers):
             ("num_probes", num_probes),
         ):
             check_positive(name, value)
-        if not 0 < decay < 1:
-            raise ValueError(f"decay must be in (0, 1), got {decay}")
+        check_within("decay", decay, "(0, 1)")
         for name, value in (("dilation", dilation), ("render_dilation", render_dilation)):
             if value not in (0, 1):
                 raise ValueError(f"{name} must be 0 or 1, got {value}")
         corners = as_box(box)
-        sides = corners[1] - corners[0]
-        cells = [max(1, round(resolution * float(s / sides.max()))) for s in sides]
+        cells = cubes(corners, resolution)
         self.threshold, self.decay = threshold, decay
         self.update_every, self.num_probes = update_every, num_probes
         self.dilation, self.render_dilation = dilation, render_dilation

@@ -6,7 +6,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import as_box, check_shape, check_whole
+from dnerf.core.checks import as_box, check_shape, check_whole, check_within
 from dnerf.core.compositing import render_weights
 from dnerf.core.geometry import clip_to_box
 from dnerf.core.quadrature import interval_depths
@@ -62,11 +62,9 @@ class ProposalSampler(Sampler, Scheduled):
             )
         for name, count in (*(("num_proposed", count) for count in num_proposed), ("num_samples", num_samples)):
             check_whole(name, count)
-        if not 0 <= anneal_end <= 1:
-            raise ValueError(f"anneal_end must be in [0, 1], got {anneal_end}")
+        check_within("anneal_end", anneal_end, "[0, 1]")
         for name, value in (("even_share", even_share), ("min_weight", min_weight)):
-            if not 0 <= value < 1:
-                raise ValueError(f"{name} must be in [0, 1), got {value}")
+            check_within(name, value, "[0, 1)")
         self.proposals = nn.ModuleList(proposals)
         self.num_proposed, self.num_samples = tuple(num_proposed), num_samples
         self.box = None if box is None else nn.Buffer(as_box(box), persistent=False)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_batch, check_positive, check_shape
 from dnerf.core.compositing import FieldOutput, safe_divide
@@ -85,8 +85,7 @@ class AnalyticScene(RadianceField, SignedDistance):
         if not bodies:
             raise ValueError("bodies must hold at least one body, got none")
         self.bodies = tuple(bodies)
-        self.register_buffer("box", as_box(box), persistent=False)
-        self.box: Tensor
+        self.box = nn.Buffer(as_box(box), persistent=False)
 
     def posed(self, times: Tensor) -> list[tuple[Body, Pose]]:
         """Each body with its poses at times (...,), or with one pose if all times are the same.

@@ -14,7 +14,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from dnerf.core.rays import Rays
+from dnerf.core.rays import Rays, parts_of
 from dnerf.scenes.motions import Motion, Wave
 from dnerf.scenes.poses import Pose
 from dnerf.scenes.shapes import Ball, Shape, Vector
@@ -109,7 +109,7 @@ def _in_rows(rows: Tensor, values: Tensor, num_rows: int) -> Tensor:
     order = order[rows[order].argsort(stable=True)]
     rows, values = rows[order], values[order]
     counts = torch.bincount(rows, minlength=num_rows)
-    columns = torch.arange(len(rows), device=rows.device) - (counts.cumsum(0) - counts)[rows]
+    columns = parts_of(counts)[1]
     width = 2 * ((int(counts.max()) + 1) // 2) if len(counts) else 0
     table = torch.full((num_rows, max(width, 2)), torch.inf, dtype=values.dtype, device=values.device)
     table[rows, columns] = values

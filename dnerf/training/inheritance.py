@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from dnerf.nn.output_labels import labels_of
+from dnerf.nn.parameter_groups import labels_of
 from dnerf.training.run import Run
 
 NUMBERS = ("step", "seconds", "progress", "num_rays", "rays_done", "rate_factor", "last_record")

@@ -1,5 +1,6 @@
 """Clouds of coloured fog that breathe: semi-transparent at all times, thinner as they grow."""
 
+from dnerf.core.checks import check_within
 from dnerf.scenes.base import AnalyticScene, Body
 from dnerf.scenes.library.palette import AMBER, CORAL, CREAM, INDIGO, PLUM, SKY, TEAL
 from dnerf.scenes.motions import Fixed, Pulse, Wave
@@ -24,8 +25,7 @@ def make_pulsing_fog(amplitude: float = 0.25) -> AnalyticScene:
     Raises:
         ValueError: for an amplitude outside its range, with which clouds would leave the box.
     """
-    if not 0 <= amplitude <= 0.3:
-        raise ValueError(f"amplitude must be in [0, 0.3], got {amplitude}")
+    check_within("amplitude", amplitude, "[0, 0.3]")
     clouds = []
     for core, rim, center, radius, density, phase in CLOUDS:
         breath = Pulse(Wave(1.0, ((amplitude, 1.0, phase),)), parent=Fixed(center))

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from dnerf.core.checks import check_positive
+from dnerf.core.checks import check_positive, check_within
 from dnerf.scenes.base import AnalyticScene, Body
 from dnerf.scenes.library.palette import AMBER, CORAL, CREAM, INDIGO, SKIN, SLATE, TEAL
 from dnerf.scenes.motions import Fixed, Joint, Motion, Slide, Spin, Wave
@@ -51,8 +51,7 @@ def make_walker(cycles: int = 1, circle_radius: float = 0.0, density: float = 80
         ValueError: if the circle leaves the board.
     """
     check_positive("cycles", cycles)
-    if not 0 <= circle_radius <= 0.35:
-        raise ValueError(f"circle_radius must be in [0, 0.35], got {circle_radius}")
+    check_within("circle_radius", circle_radius, "[0, 0.35]")
     path = Fixed((0.0, -circle_radius, GROUND + 0.76), parent=Spin() if circle_radius > 0 else None)
     hips = Slide(Wave(-0.025, ((0.025, 2.0 * cycles, 0.25),)), parent=path)
     twist = Joint(angle=Wave(0.0, ((0.12, cycles, 0.5),)), parent=hips)
