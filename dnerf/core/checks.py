@@ -17,8 +17,7 @@ def check_shape(name: str, value: Tensor, shape: Sequence[int | str]) -> None:
 
 def check_batch(name: str, value: Tensor, positions: Tensor) -> None:
     """Raise unless `value` has the batch shape of `positions` (..., 3), as times must."""
-    if value.shape != positions.shape[:-1]:
-        raise ValueError(f"{name} must have shape {tuple(positions.shape[:-1])}, got {tuple(value.shape)}")
+    check_shape(name, value, positions.shape[:-1])
 
 
 def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:

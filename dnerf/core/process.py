@@ -56,7 +56,7 @@ def yield_to_other_programs() -> bool:
 
 def num_openmp_threads() -> int:
     """Threads that OpenMP will use: as many as this process has cores, or fewer if OMP_NUM_THREADS says so."""
-    cores = len(_cores())
+    cores = len(usable_cores())
     wanted = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
     return min(int(wanted), cores) if wanted.isdecimal() and int(wanted) > 0 else cores
 
@@ -72,7 +72,7 @@ def _watch(number: int) -> None:
 
 def free_core_seconds() -> float:
     """Seconds that this process's cores, together, were idle or worked for it; only differences have a meaning."""
-    names = {f"cpu{core}" for core in _cores()}
+    names = {f"cpu{core}" for core in usable_cores()}
     idle = 0
     for line in Path("/proc/stat").read_text(encoding="ascii").splitlines():
         name, *ticks = line.split()
@@ -81,7 +81,8 @@ def free_core_seconds() -> float:
     return idle / os.sysconf("SC_CLK_TCK") + time.process_time()
 
 
-def _cores() -> set[int]:
+def usable_cores() -> set[int]:
+    """The cores that this process may use."""
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 
@@ -110,5 +111,5 @@ def _hold_threads(parallel: "ctypes._NamedFuncPointer", end: threading.Event) ->
     """A parallel region that does nothing; the threads made for it live as long as the one that entered it."""
     nothing = ctypes.CDLL(None).free  # of a null pointer
     parallel.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint)
-    parallel(ctypes.cast(nothing, ctypes.c_void_p), None, len(_cores()) + 1, 0)
+    parallel(ctypes.cast(nothing, ctypes.c_void_p), None, len(usable_cores()) + 1, 0)
     end.wait()

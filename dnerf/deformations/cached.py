@@ -93,7 +93,7 @@ class CachedAtTime(Deformation):
         self.pad_to = pad_to
         self.faces = list(faces)
         num_vertices = math.prod(len(x) for x in self.faces)
-        self.levels = GridLevels([[len(x) - 1 for x in self.faces]], 1 << (num_vertices - 1).bit_length())
+        self.levels = GridLevels.dense([[len(x) - 1 for x in self.faces]])
         self.low = torch.stack([x[0] for x in self.faces])
         self.sides = torch.stack([x[-1] for x in self.faces]) - self.low
         self.displacements = torch.full((num_vertices, 4), torch.nan)  # four, so that rows are aligned

@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 
 from dnerf import __version__
+from dnerf.core.process import usable_cores
 
 
 @cache
 def hardware() -> str:
     """The processor, the number of cores this process may use and the GPU if there is one, in one line."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    parts = [f"{cores} x {_processor()}"]
+    parts = [f"{len(usable_cores())} x {_processor()}"]
     if torch.cuda.is_available():
         parts.append(torch.cuda.get_device_name())
     return ", ".join(parts)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dnerf.core.checks import check_shape
+from dnerf.core.geometry import check_last_axis
 
 TOUCHING = 1e-3  # Share of background in an interpolated pixel that is rounding
 
@@ -19,8 +20,7 @@ def sample_image(image: Tensor, pixels: Tensor) -> Tensor:
         image: (H, W, C) or (H, W), from which (..., C) or (...,) are taken.
         pixels: (..., 2) column and row; whole numbers hit pixels. ValueError for another shape or NaN.
     """
-    if pixels.shape[-1:] != (2,):
-        raise ValueError(f"pixels must have shape (..., 2), got {tuple(pixels.shape)}")
+    check_last_axis("pixels", pixels, 2)
     if bool(pixels.isnan().any()):
         raise ValueError(f"pixels must be numbers, got {int(pixels.isnan().any(-1).sum())} that are not")
     height, width = image.shape[:2]
@@ -100,8 +100,7 @@ def temporal_psnr(predictions: Tensor, truths: Tensor) -> float:
         truths: same shape, in [0, 1]; ValueError otherwise.
     """
     _check_frames(predictions, 2)
-    if truths.shape != predictions.shape:
-        raise ValueError(f"truths must have shape {tuple(predictions.shape)}, got {tuple(truths.shape)}")
+    check_shape("truths", truths, predictions.shape)
     error = predictions.float().clamp(0, 1) - truths.float()
     return float(-10 * error.diff(dim=0).square().mean().log10())
 

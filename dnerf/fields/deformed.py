@@ -13,7 +13,6 @@ from dnerf.fields.base import (
     FrameTabled,
     IntervalAware,
     NetworkTabled,
-    NetworkTables,
     RadianceField,
     SignedDistance,
     ends_of,
@@ -132,20 +131,13 @@ def _frame_tables(canonical: RadianceField, grid: MarchGrid, **lattice: Tensor) 
     if not isinstance(canonical, NetworkTabled) or not speaks_for(canonical, "network_tables", "forward"):
         return warn_of_generic_path(f"a canonical {type(canonical).__name__}")
     network = canonical.network_tables()
-    if network is None or not _is_served(network):
+    if network is None or any(x.dtype != torch.float32 for x in (network.table, network.low, network.shifts)):
         return None
+    if not is_traced(network.table, network.weights[0].shape[1], network.weights):
+        widths = [network.weights[0].shape[1], *map(len, network.weights)]
+        return warn_of_generic_path(f"layers of widths {widths} here: hidden ones in multiples of 16, on AVX512-BF16")
     return FrameTables(
         occupancy=grid.occupancy, skips=grid.skips, aabb=grid.aabb, field_low=network.low, field_scale=network.scale,
         table=network.table, shifts=network.shifts, levels=network.levels, weights=network.weights,
         biases=network.biases, **lattice,
     )  # fmt: skip
-
-
-def _is_served(network: NetworkTables) -> bool:
-    if any(tensor.dtype != torch.float32 for tensor in (network.table, network.low, network.shifts)):
-        return False
-    is_served = is_traced(network.table, network.weights[0].shape[1], network.weights)
-    if not is_served:
-        widths = [network.weights[0].shape[1], *map(len, network.weights)]
-        warn_of_generic_path(f"layers of widths {widths} here: hidden ones in multiples of 16, on AVX512-BF16")
-    return is_served

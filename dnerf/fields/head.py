@@ -81,7 +81,10 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
             in_features += space_time.out_features
         color_terms = temporal_terms + (self.view_degree + 1) ** 2 - 1
         self.head = MLP(in_features, hidden_features, num_layers, out_features=temporal_terms + 3 * color_terms)
-        self._begin_constant()
+        with torch.no_grad():  # a fresh series begins without the terms that change
+            for part in self._last:
+                density, colors = self._series(part)
+                density[1:], colors[:, 1:] = 0, 0
 
     @abstractmethod
     def _features(self, positions: Tensor, times: Tensor) -> Tensor:
@@ -91,13 +94,6 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
     def is_static(self) -> bool:
         """Whether neither the head nor its series sees times."""
         return self.encode_times is None and self.space_time is None and self.temporal_terms == 1
-
-    @torch.no_grad()
-    def _begin_constant(self) -> None:
-        """Let a fresh head's series begin without the terms that change."""
-        for part in self._last:
-            density, colors = self._series(part)
-            density[1:], colors[:, 1:] = 0, 0
 
     def _series(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
         """Of density (D, ...) and of colours (3, K, ...): parts of what the head has for each output."""

@@ -43,7 +43,14 @@ class ImportanceSampler(Sampler):
     def forward(self, rays: Rays, field: RadianceField, *, generator: torch.Generator | None = None) -> Samples:
         """Dense samples (R, num_coarse + num_fine), with the coarse pass in `proposals` if it has its own network."""
         coarse = self.coarse(rays, field, generator=generator)
-        density, proposals = self._coarse_pass(rays, coarse, field)
+        positions, directions, times = coarse.locate(rays)
+        proposals: tuple[tuple[Samples, FieldOutput], ...] = ()
+        if self.proposal is None:
+            with torch.no_grad():
+                density = field.density(positions, times)
+        else:
+            proposals = ((coarse, self.proposal(positions, directions, times)),)
+            density = proposals[0][1].density
         edges = torch.cat([coarse.starts, coarse.ends[:, -1:]], dim=-1)
         weights = render_weights(interval_depths(density.detach(), coarse.lengths), coarse)
         drawn = sample_piecewise_constant(edges, weights, self.num_fine, randomized=self.training, generator=generator)
@@ -51,13 +58,3 @@ class ImportanceSampler(Sampler):
         starts, ends = merged[:, :-1], merged[:, 1:]
         within = random_points(starts, ends, generator) if self.training else None
         return Samples(starts, ends, len(rays), points=within, proposals=proposals)
-
-    def _coarse_pass(
-        self, rays: Rays, coarse: Samples, field: RadianceField
-    ) -> tuple[Tensor, tuple[tuple[Samples, FieldOutput], ...]]:
-        positions, directions, times = coarse.locate(rays)
-        if self.proposal is None:
-            with torch.no_grad():
-                return field.density(positions, times), ()
-        output = self.proposal(positions, directions, times)
-        return output.density, ((coarse, output),)

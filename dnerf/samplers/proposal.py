@@ -103,17 +103,12 @@ class ProposalSampler(Sampler, Scheduled):
         inner = edges[:, :0]
         if count > 1:
             power = self.training_power if self.training else 1.0
-            histogram = weights.detach() ** power
-            inner = sample_piecewise_constant(
-                edges, self._evened(edges, histogram), count - 1, randomized=self.training, generator=generator
-            )
+            lengths = edges.diff(dim=-1)
+            total = lengths.sum(-1, keepdim=True)
+            even = torch.where(total > 0, lengths / torch.where(total > 0, total, 1.0), 1 / lengths.shape[-1])
+            evened = weights.detach() ** power + self.even_share / (1 - self.even_share) * even
+            inner = sample_piecewise_constant(edges, evened, count - 1, randomized=self.training, generator=generator)
         return torch.cat([edges[:, :1], inner, edges[:, -1:]], dim=-1)
-
-    def _evened(self, edges: Tensor, histogram: Tensor) -> Tensor:
-        lengths = edges.diff(dim=-1)
-        total = lengths.sum(-1, keepdim=True)
-        even = torch.where(total > 0, lengths / torch.where(total > 0, total, 1.0), 1 / lengths.shape[-1])
-        return histogram + self.even_share / (1 - self.even_share) * even
 
     def _weights(self, proposal: RadianceField, rays: Rays, edges: Tensor) -> Tensor:
         """Weights (R, S) of a proposal, evaluated in the middle of intervals (R, S + 1), with gradients to it."""
