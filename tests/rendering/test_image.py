@@ -139,7 +139,7 @@ def test_the_kernel_is_used_only_for_what_it_was_made_for(fused: list[Tensor]) -
 
 @vectors
 @pytest.mark.parametrize(("options", "part"), [
-    ({"space_time": SpaceTimeVolumes(BOX, (3,), (2,), num_features=2)}, "space_time volumes"),
+    ({"space_time": SpaceTimeVolumes(BOX, (3,), (2,), num_features=2)}, "space_time features"),
     ({"hidden_features": 12}, r"layers of widths [8, 12, 12, 4]"),
 ])  # fmt: skip
 def test_parts_that_keep_a_model_from_the_kernel_are_named(
