@@ -107,7 +107,7 @@ def write_gltf(
             normalized=values.dtype == torch.uint16, min=values.amin(0).tolist() if is_real else [],
             max=values.amax(0).tolist() if is_real else [],
         ))  # fmt: skip
-        blob.extend(data + bytes(-len(data) % 4))
+        blob.extend(data)  # a multiple of four bytes, as the next one's offset has to be
         return len(gltf.accessors) - 1
 
     attributes = lib.Attributes(

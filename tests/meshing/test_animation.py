@@ -88,7 +88,7 @@ def test_vertices_without_a_place_are_filled_in_left_out_and_counted():
     x = made.mesh.vertices[:, 0]
     beyond = int((mesh.vertices[:, 0] > 0.401).sum())
     assert made.num_left_out >= beyond > 20
-    assert x.max() < 0.401
+    assert 0.3 < x.max() < 0.401
     torch.testing.assert_close(made.is_found, ~((x > 0.201) & (TIMES[:, None] > 0.6)))
     assert (made.positions[4] - made.mesh.vertices).norm(dim=-1).max() < 1e-2  # as their neighbours, which stand still
     assert f"{made.num_left_out} vertices left out" in made.summary()

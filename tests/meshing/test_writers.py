@@ -9,7 +9,7 @@ import torch
 from exact_shapes import BOX, ExactSurface, InvertibleRigid, torus
 
 from dnerf.data.normalization import Similarity
-from dnerf.meshing import animate, extract_surface, own_units, write_gltf, write_meshes
+from dnerf.meshing import animate, extract_surface, write_gltf, write_meshes
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("pygltflib")
@@ -135,11 +135,14 @@ def test_frames_are_read_back_in_the_data_sets_units(animation, tmp_path, format
     folder = write_meshes(map(animation.frame, range(6)), tmp_path / "frames", format, similarity=OWN)
     assert sorted(path.name for path in folder.iterdir()) == [f"mesh_{i:05d}.{format}" for i in range(6)]
     for i in (0, 5):
-        read, own = trimesh.load(folder / f"mesh_{i:05d}.{format}", process=False), own_units(animation.frame(i), OWN)
-        np.testing.assert_allclose(read.vertices, OWN.positions_from_world(animation.positions[i]), atol=2e-6)
-        assert np.array_equal(read.faces, own.faces)
-        np.testing.assert_allclose(read.vertex_normals, own.normals, atol=1e-4)
-        np.testing.assert_allclose(read.visual.vertex_colors[:, :3] / 255, own.rgb, atol=0.004)
+        read, faces = trimesh.load(folder / f"mesh_{i:05d}.{format}", process=False), animation.mesh.faces
+        own = OWN.positions_from_world(animation.positions[i])
+        np.testing.assert_allclose(read.vertices, own, atol=2e-6)
+        assert np.array_equal(read.faces, faces)
+        origin, normals = OWN.positions_from_world(torch.zeros(3)), animation.frame(i).normals
+        exact = OWN.scale * (OWN.positions_from_world(normals) - origin)
+        np.testing.assert_allclose(read.vertex_normals, exact, atol=1e-4)
+        np.testing.assert_allclose(read.visual.vertex_colors[:, :3] / 255, animation.mesh.rgb, atol=0.004)
         assert read.is_watertight
 
 
