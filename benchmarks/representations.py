@@ -3,6 +3,8 @@
 from statistics import fmean
 from typing import Any
 
+import torch
+
 from benchmarks.runs import Run, run_training
 from benchmarks.scenes import scene_overrides
 from benchmarks.suite import Settings, SuiteResult, Table
@@ -27,7 +29,7 @@ def run(settings: Settings) -> SuiteResult:
         ]
         rows.append(_row(name, kind, runs))
         images.append(_shown(settings, options, str(folders[0])))
-    write_png(contact_sheet(images, LAYERS, list(kinds)), settings.work_dir / SHEET)
+    write_png(contact_sheet(list(zip(*images, strict=True)), list(kinds), LAYERS), settings.work_dir / SHEET)
     return SuiteResult(
         title="Representations",
         summary=(
@@ -65,13 +67,16 @@ def _row(name: str, kind: dict[str, Any], runs: list[Run]) -> dict[str, Any]:
 
 
 def _shown(settings: Settings, options: dict[str, Any], folder: str) -> list[Any]:
-    """The layers of one held-out frame."""
+    """The layers of one held-out frame, at half its size."""
     model = settings.finished(folder)
     frames = model["data"].frames("test")
     number = min(options["frame"], len(frames) - 1)
     view = View(frames.camera(number), float(frames.times[number]))
     layers = render_layers(model["renderer"], view, None, LAYERS, chunk=model["chunk"])
-    return [layers[name] for name in LAYERS]
+    share = layers["opacity"][..., None].clip(0, 1)
+    shown = (layers["rgb"] / 255, share * 0.5 * (layers["normals"] + 1) + 1 - share)
+    halved = (torch.nn.functional.avg_pool2d(torch.from_numpy(x).movedim(2, 0).float(), 2) for x in shown)
+    return [x.movedim(0, 2) for x in halved]
 
 
 def _overrides(settings: Settings, options: dict[str, Any], words: list[str], seed: int) -> list[str]:
