@@ -24,7 +24,6 @@ from dnerf.kernels import (
     relu_layers,
     series_sums,
     skip_distances,
-    thin_out,
     use_backend,
 )
 
@@ -35,7 +34,6 @@ RESOLUTIONS = (16, 32, 64, 128)
 NUM_FEATURES = 8
 MAX_ROWS = 1 << 17
 STEP = 0.03
-SPACING = 0.06  # along a ray, of samples at which the deformation is evaluated
 WIDTHS = (32, 128, 128, 128, 128)  # of the network of a deformation
 SERIES = (4 + 3 * 12, 12)  # coefficients of density and colours, and functions of time and direction
 HEAD = (len(RESOLUTIONS) * NUM_FEATURES, 64, 64, 4)  # of the network behind a grid's features
@@ -133,12 +131,10 @@ def training_cases(work: Workload) -> list[Case]:
     ]
     if work.points.is_cuda:
         return [*cases, Case("march_to_size", "forward", backends(work.march_to_size), marching_bytes)]
-    times = work.rays.times[work.marched.ray_indices]
     skips_bytes = work.occupancy.nbytes + work.skips.nbytes
     return [
         *cases,
         *_network_cases(work, n),
-        Case("thin_out", "forward", backends(partial(thin_out, work.points, times, SPACING)), 8 * n),
         Case("skip_distances", "forward", backends(partial(skip_distances, work.occupancy)), skips_bytes),
     ]
 

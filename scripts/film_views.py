@@ -3,10 +3,9 @@
 import math
 import sys
 from collections.abc import Sequence
-from typing import Any, cast
 
 import torch
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig
 from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics
@@ -146,10 +145,10 @@ def _resized(intrinsics: Intrinsics, resolution: int | ListConfig | None) -> Int
 
 
 def _times(config: DictConfig, scene: SceneRecord, count: int) -> list[float]:
-    clock, slow = scene.world.clock if config.clock == "data" else None, OmegaConf.to_container(config.slow_motion)
+    clock = scene.world.clock if config.clock == "data" else None
     own = config.time_range is not None
     limits, time = tuple(config.time_range) if own else scene.times, "sweep" if config.time is None else config.time
-    return film_times(count, time, limits, clock if own else None, clock, cast(Any, slow))
+    return film_times(count, time, limits, clock if own else None, clock)
 
 
 def _warn_of_times(times: Sequence[float], scene: SceneRecord) -> None:

@@ -81,10 +81,9 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
         "resolution": _either(
             "a width or [width,height] in pixels, or null", POSITIVE.or_null(), _listed(POSITIVE, "", 2)
         ),
-        "time": _either("sweep, pingpong, slow, a number or null", TEXT, NUMBER.or_null()),
+        "time": _either("sweep, pingpong, a number or null", TEXT, NUMBER.or_null()),
         "time_range": _listed(NUMBER, "two times", 2).or_null(), "clock": _one_of("run", "data"),
         "subdivision": POSITIVE.or_null(),
-        "slow_motion.center": NUMBER, "slow_motion.width": NUMBER, "slow_motion.factor": NUMBER,
         "path.split": SPLIT, "path.frame": COUNT.or_null(), "path.radius": NUMBER.or_null(),
         "path.elevation": NUMBER.or_null(), "path.azimuth": NUMBER.or_null(), "path.turns": NUMBER.or_null(),
         "path.start_angle": NUMBER.or_null(), "path.target": PLACE.or_null(),

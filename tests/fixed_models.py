@@ -14,7 +14,6 @@ from dnerf.losses import (
     Loss,
     PhotometricLoss,
     UnseenSpaceLoss,
-    VolumeLoss,
 )
 from dnerf.rendering.renderer import Renderer
 
@@ -41,8 +40,7 @@ def losses() -> dict[str, Loss]:
     return {
         "rgb": PhotometricLoss(),
         "elastic": ElasticLoss(every=2),
-        "volume": VolumeLoss(Fade(3e-3)),
-        "jacobian": JacobianDeterminantLoss(),
+        "jacobian": JacobianDeterminantLoss(Fade(1e-2)),
         "appearance": AppearanceConstancyLoss(every=4),
         "unseen_space": UnseenSpaceLoss(BOX, memory_samples=200, every=4),
     }

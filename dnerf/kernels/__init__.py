@@ -15,12 +15,11 @@ from .seen_parts import SeenParts, seen_parts
 from .series_sums import series_sums
 from .shade import shade
 from .skip_distances import skip_distances
-from .thin_out import thin_out
 from .trace_network import FrameTables, is_traced, trace_network
 
 __all__ = [
     "BACKENDS", "Footprints", "FrameTables", "GridLevels", "MarchGrid", "MarchedSamples", "SeenParts", "add_seen",
     "covered_places", "footprints", "get_backend", "grid_encode", "grid_network", "is_bfloat16_wanted", "is_traced",
     "march", "march_to_size", "packed_sum", "packed_weights", "relu_layers", "seen_parts", "series_sums",
-    "set_backend", "shade", "skip_distances", "thin_out", "trace_network", "use_backend",
+    "set_backend", "shade", "skip_distances", "trace_network", "use_backend",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Terms about motion, for any deformation: elastic, volume-keeping, against folds, and constancy of what it carries.
+"""Terms about motion, for any deformation: elastic, against folds, and constancy of what it carries.
 
 They look at some of a batch's own samples, weighted by their share in the image: motion of empty space is free.
 Derivatives in space are finite differences, since compiled kernels are differentiable once.
@@ -151,55 +151,15 @@ class RestLoss(DeformationLoss):
         return (moved - points.positions).square().sum(-1).clamp(min=LEAST_DISTANCE**2).sqrt()
 
 
-class VolumeLoss(DeformationLoss):
-    """Squared logarithm of how much the deformation changes volumes: what moves should keep them and not fold.
-
-    For a deformation D: `(log det (dD / dx))^2`, zero for all that keeps volumes, and large before a map folds, which
-    has to pass through a determinant of zero. A logarithm has no value beyond that: below `least` it goes on straight,
-    so that what has folded is pulled back.
-
-    Source: volume preservation in image registration (Rohlfing et al. 2003, there the absolute logarithm);
-    deviation: its square, and the straight end.
-
-    Args:
-        weight, num_points, every, saturation: see `DeformationLoss`.
-        distance: of the forward differences, in world units.
-        least: determinant below which the logarithm goes on as its tangent.
-
-    Raises:
-        ValueError: as `DeformationLoss`, and for a distance or a least determinant that is not positive.
-    """
-
-    def __init__(
-        self, weight: float | Schedule = 3e-3, num_points: int = 256, *, distance: float = 0.02, least: float = 0.1,
-        saturation: float | None = None, every: int = 4,
-    ) -> None:  # fmt: skip
-        super().__init__(weight, num_points, every=every, saturation=saturation)
-        check_positive("distance", distance)
-        check_positive("least", least)
-        self.distance, self.least = distance, least
-
-    def _penalty(self, field: DeformedField, points: MotionPoints) -> Tensor:
-        return self.logarithms(field, points).square()
-
-    def logarithms(self, field: DeformedField, points: MotionPoints) -> Tensor:
-        """Logarithm of the determinant (M,), of finite differences along the three axes; below `least` its tangent."""
-        steps = self.distance * torch.eye(3, dtype=points.positions.dtype, device=points.positions.device)
-        places = points.positions + torch.cat([torch.zeros_like(steps[:1]), steps])[:, None]
-        here, *there = unwrapped(field.deformation)(places, points.times.expand(places.shape[:-1])).unbind()
-        x, y, z = ((end - here) / self.distance for end in there)
-        determinant = (torch.linalg.cross(x, y) * z).sum(-1)
-        return torch.log(determinant.clamp(min=self.least)) + (determinant / self.least - 1).clamp(max=0)
-
-
-class JacobianDeterminantLoss(VolumeLoss):
+class JacobianDeterminantLoss(DeformationLoss):
     """Squared logarithm of how far the deformation falls short of a part of each volume: space must not fold.
 
     For a deformation D: `min(0, log (det (dD / dx) / limit))^2`, nothing where more than `limit` of a volume is left,
-    so that it can be strict, and last, where `VolumeLoss` would hold back what really happens.
+    and large before a map folds, which has to pass through a determinant of zero. A logarithm has no value beyond that:
+    below `least` it goes on straight, so that what has folded is pulled back.
 
     Source: penalties of negative determinants in image registration (Kuang and Schmah 2019, there of -det above zero);
-    deviation: it begins before anything folds, see `VolumeLoss`.
+    deviation: it begins before anything folds, and the straight end.
 
     Args:
         weight, num_points, every: see `DeformationLoss`.
@@ -208,21 +168,30 @@ class JacobianDeterminantLoss(VolumeLoss):
         least: determinant below which the logarithm goes on as its tangent.
 
     Raises:
-        ValueError: as `VolumeLoss`, and for a limit that is not in [least, 1].
+        ValueError: as `DeformationLoss`, for a distance or a least determinant that is not positive, and for a limit
+            that is not in [least, 1].
     """
 
     def __init__(
         self, weight: float | Schedule = 1e-2, num_points: int = 256, *, limit: float = 0.5, distance: float = 0.005,
         least: float = 0.1, every: int = 4,
     ) -> None:  # fmt: skip
-        super().__init__(weight, num_points, distance=distance, least=least, every=every)
+        super().__init__(weight, num_points, every=every)
+        check_positive("distance", distance)
+        check_positive("least", least)
         if not least <= limit <= 1:
             raise ValueError(f"limit must be in [least, 1] = [{least}, 1], got {limit}")
-        self.limit = limit
+        self.limit, self.distance, self.least = limit, distance, least
 
     def _penalty(self, field: DeformedField, points: MotionPoints) -> Tensor:
-        """Squared logarithm of the determinant to the limit, where it is smaller."""
-        return (self.logarithms(field, points) - math.log(self.limit)).clamp(max=0).square()
+        """Squared logarithm of the determinant, of differences along the axes, to the limit where it is smaller."""
+        steps = self.distance * torch.eye(3, dtype=points.positions.dtype, device=points.positions.device)
+        places = points.positions + torch.cat([torch.zeros_like(steps[:1]), steps])[:, None]
+        here, *there = unwrapped(field.deformation)(places, points.times.expand(places.shape[:-1])).unbind()
+        x, y, z = ((end - here) / self.distance for end in there)
+        determinant = (torch.linalg.cross(x, y) * z).sum(-1)
+        logarithms = torch.log(determinant.clamp(min=self.least)) + (determinant / self.least - 1).clamp(max=0)
+        return (logarithms - math.log(self.limit)).clamp(max=0).square()
 
 
 class AppearanceConstancyLoss(DeformationLoss):

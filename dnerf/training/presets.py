@@ -11,7 +11,7 @@ from dnerf.core.schedules import Ramp
 from dnerf.data.folder import FolderData
 from dnerf.data.frames import Frames
 from dnerf.data.pixel_samplers import ErrorGuidedPixels, TemporalCurriculum
-from dnerf.deformations import AlongRaysDeformation, CachedDeformation, Deformation, DisplacementDeformation
+from dnerf.deformations import CachedDeformation, Deformation, DisplacementDeformation
 from dnerf.fields import DeformedField, GridField, RadianceField
 from dnerf.losses import AppearanceConstancyLoss, ElasticLoss, PhotometricLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 from dnerf.rendering.renderer import Renderer
@@ -65,14 +65,13 @@ def make_renderer(
         )
     if field is None:
         field = GridField(corners, (16, 32, 64, 128, 256), temporal_terms=4, window_end=0.3)
-    along_rays = AlongRaysDeformation(deformation, 0.06)
     sampler = OccupancySampler(
         OccupancyGrid(corners, 64, decay=0.6, render_dilation=0),
         Ramp(0.04, 0.028, end=0.5, kind="exponential"),
         subdivision=2, render_subdivision=3, subdivision_weight=0.02, narrow_from=0.3, min_weight=1e-4, filter_joins=2,
     )  # fmt: skip
     return Renderer(
-        DeformedField(CachedDeformation(along_rays, corners), field),
+        DeformedField(CachedDeformation(deformation, corners), field),
         sampler,
         RandomBackground("white") if background is None else background,
         precision="bfloat16",

@@ -1,14 +1,11 @@
 """Time paths: the time of every frame of a film."""
 
-import math
-from collections.abc import Mapping, Sequence
-
-import torch
+from collections.abc import Sequence
 
 from dnerf.core.checks import check_choice, check_positive
 from dnerf.data.normalization import Clock
 
-TIME_PATHS = ("sweep", "pingpong", "slow")
+TIME_PATHS = ("sweep", "pingpong")
 ROUNDING = 1e-6  # of the clock, beyond either end of what there is
 
 
@@ -18,17 +15,15 @@ def film_times(
     limits: Sequence[float] = (0.0, 1.0),
     limits_clock: Clock | None = None,
     clock: Clock | None = None,
-    slow_motion: Mapping[str, float] | None = None,
 ) -> list[float]:
     """Times of a film in [0, 1].
 
     Args:
         num_frames: of the film.
-        time: "sweep", "pingpong" or "slow" from the first limit to the second, or one time for all frames.
+        time: "sweep" or "pingpong" from the first limit to the second, or one time for all frames.
         limits: two times.
         limits_clock: of the limits; None if they are in [0, 1].
-        clock: of one time, and of the slow motion's centre and width; None if they are in [0, 1].
-        slow_motion: arguments of `slow_motion_times`.
+        clock: of one time; None if it is in [0, 1].
 
     Raises:
         ValueError: for another word, or times out of range.
@@ -37,13 +32,7 @@ def film_times(
         return [_normalised("time", time, clock)] * num_frames
     check_choice("time", time, TIME_PATHS)
     start, end = (_normalised("time_range", value, limits_clock) for value in limits)
-    if time != "slow":
-        return (sweep_times if time == "sweep" else pingpong_times)(num_frames, start, end)
-    slow = dict(slow_motion or {})
-    if clock is not None:
-        slow["center"] = _normalised("slow_motion.center", slow["center"], clock)
-        slow["width"] /= clock.length
-    return slow_motion_times(num_frames, start=start, end=end, **slow)
+    return (sweep_times if time == "sweep" else pingpong_times)(num_frames, start, end)
 
 
 def _normalised(name: str, value: float, clock: Clock | None) -> float:
@@ -69,56 +58,14 @@ def pingpong_times(num_frames: int, start: float = 0.0, end: float = 1.0) -> lis
     return [_between(start, end, 1 - abs(1 - 2 * i / num_frames)) for i in range(num_frames)]
 
 
-def slow_motion_times(
-    num_frames: int,
-    *,
-    center: float = 0.5,
-    width: float = 0.4,
-    factor: float = 4.0,
-    start: float = 0.0,
-    end: float = 1.0,
-) -> list[float]:
-    """A sweep that slows down smoothly around one time, monotone from `start` to `end`.
-
-    Frames per unit of time rise from 1 to `factor` and fall again, with the profile
-
-        p(t) = 1 + (factor - 1) cos^2(pi (t - center) / width)    within width / 2 of the centre, 1 elsewhere.
-
-    Frames lie at even steps of its integral. Raises ValueError for numbers out of range.
-
-    Args:
-        center: the slowest time, in [0, 1].
-        width: of the slow stretch of time, > 0.
-        factor: how many times slower the scene runs at the centre than outside, >= 1.
-    """
-    _check(num_frames, start, end, center=center)
-    check_positive("width", width)
-    if not 1 <= factor < math.inf:
-        raise ValueError(f"factor must be at least 1 and finite, got {factor}")
-
-    def frames_until(times: torch.Tensor) -> torch.Tensor:
-        within = (times - center).clamp(-width / 2, width / 2)
-        window = within / 2 + width / (4 * math.pi) * torch.sin(2 * math.pi * within / width)
-        return times + (factor - 1) * window
-
-    first, last = frames_until(torch.tensor([start, end], dtype=torch.float64)).tolist()
-    wanted = torch.tensor([first + (last - first) * s for s in sweep_times(num_frames)], dtype=torch.float64)
-    low, high = (torch.full_like(wanted, pick(start, end)) for pick in (min, max))
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        before = frames_until(middle) < wanted
-        low, high = torch.where(before, middle, low), torch.where(before, high, middle)
-    return (0.5 * (low + high)).tolist()
-
-
 def _between(start: float, end: float, share: float) -> float:
     """The time at a share of the way, never beyond either end by rounding."""
     time = start + (end - start) * share
     return min(max(time, min(start, end)), max(start, end))
 
 
-def _check(num_frames: int, start: float, end: float, **others: float) -> None:
+def _check(num_frames: int, start: float, end: float) -> None:
     check_positive("num_frames", num_frames)
-    for name, value in (("start", start), ("end", end), *others.items()):
+    for name, value in (("start", start), ("end", end)):
         if not 0 <= value <= 1:
             raise ValueError(f"{name} must be in [0, 1], got {value}")

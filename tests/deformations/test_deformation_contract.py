@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from dnerf.deformations import (
-    AlongRaysDeformation,
     CachedDeformation,
     Deformation,
     DisplacementDeformation,
@@ -53,7 +52,6 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
             for name in ("first", "second")
         }
     ),
-    "along rays": lambda: AlongRaysDeformation(small_displacement(), 0.1),
     "cached": lambda: CachedDeformation(small_displacement(), BOX),
 }
 INVERTIBLE = [name for name, make in DEFORMATIONS.items() if isinstance(make(), InvertibleDeformation)]

@@ -11,7 +11,7 @@ from torch import Tensor
 from benchmarks.closed_flows import Rotation
 from dnerf.core.cameras import Camera, Intrinsics, look_at
 from dnerf.data import render_exact
-from dnerf.deformations import AlongRaysDeformation, DisplacementDeformation, FlowDeformation, IdentityDeformation
+from dnerf.deformations import CachedDeformation, DisplacementDeformation, FlowDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, NeRFField
 from dnerf.motion import MotionVectors, carry, follow, motion_model, motion_vectors, render_motion
 from dnerf.rendering.renderer import Renderer
@@ -76,7 +76,7 @@ def some_grid(**changing: object) -> GridField:
 
 def test_motion_is_that_of_the_deformation_or_of_the_scene() -> None:
     scene, flow = spinning_ball(), Turning()
-    field = DeformedField(AlongRaysDeformation(flow, 0.1), some_grid(temporal_terms=2))
+    field = DeformedField(CachedDeformation(flow, [[-1.0] * 3, [1.0] * 3], 4), some_grid(temporal_terms=2))
     assert motion_model(field) is flow
     assert motion_model(Renderer(field, StratifiedSampler(4))) is flow
     assert motion_model(scene) is scene

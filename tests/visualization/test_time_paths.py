@@ -1,11 +1,9 @@
-import itertools
-import math
 from collections.abc import Callable
 
 import pytest
 
 from dnerf.data.normalization import Clock
-from dnerf.visualization import film_times, pingpong_times, slow_motion_times, sweep_times
+from dnerf.visualization import film_times, pingpong_times, sweep_times
 
 
 def test_a_sweep_has_even_steps_and_both_ends_and_a_pingpong_closes() -> None:
@@ -18,32 +16,12 @@ def test_a_sweep_has_even_steps_and_both_ends_and_a_pingpong_closes() -> None:
     assert steps == pytest.approx([1 / 3] * 6)
 
 
-@pytest.mark.parametrize("path", [sweep_times, pingpong_times, slow_motion_times])
+@pytest.mark.parametrize("path", [sweep_times, pingpong_times])
 def test_rounding_never_leaves_the_range(path: Callable[..., list[float]]) -> None:
     for end in (0.4, 0.3, 1.0, 0.1):
         for count in (25, 49, 60, 100):
             assert all(0 <= time <= end for time in path(count, start=end, end=0.0))
             assert all(0 <= time <= end for time in path(count, start=0.0, end=end))
-
-
-@pytest.mark.parametrize(("center", "width", "factor"), [(0.5, 0.4, 4.0), (0.3, 0.3, 10.0), (0.0, 0.6, 3.0)])
-def test_slow_motion_runs_at_the_stated_pace(center: float, width: float, factor: float) -> None:
-    times = slow_motion_times(2001, center=center, width=width, factor=factor)
-    assert times[0] == pytest.approx(0, abs=1e-12)
-    assert times[-1] == pytest.approx(1, abs=1e-12)
-    steps = [b - a for a, b in itertools.pairwise(times)]
-    outside = steps[-1]  # t = 1 lies outside the slow stretch of all cases
-    for time, step in zip(times, steps):
-        u = (time + step / 2 - center) / width
-        pace = 1 + (factor - 1) * math.cos(math.pi * u) ** 2 if abs(u) < 0.5 else 1
-        # steps are finite: the pace changes by up to pi (factor - 1) / width a unit of time within one
-        assert outside / step == pytest.approx(pace, abs=2 * (factor - 1) * outside * math.pi / width + 1e-6)
-
-
-def test_slow_motion_of_factor_one_is_a_sweep_and_runs_backwards_too() -> None:
-    assert slow_motion_times(7, factor=1) == pytest.approx(sweep_times(7), abs=1e-12)
-    forwards = slow_motion_times(9, center=0.5)
-    assert slow_motion_times(9, center=0.5, start=1, end=0) == pytest.approx(forwards[::-1], abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -52,14 +30,11 @@ def test_slow_motion_of_factor_one_is_a_sweep_and_runs_backwards_too() -> None:
         ({"num_frames": 0}, "num_frames"),
         ({"num_frames": 3, "start": -0.1}, "start"),
         ({"num_frames": 3, "end": 1.5}, "end"),
-        ({"num_frames": 3, "center": 2}, "center"),
-        ({"num_frames": 3, "width": 0}, "width"),
-        ({"num_frames": 3, "factor": 0.5}, "factor"),
     ],
 )
 def test_numbers_out_of_range_are_named(arguments: dict, named: str) -> None:
     with pytest.raises(ValueError, match=f"^{named} must be"):
-        slow_motion_times(**arguments)
+        pingpong_times(**arguments)
 
 
 def test_times_of_a_film_follow_a_clock_and_are_refused_beyond_it() -> None:
@@ -67,11 +42,9 @@ def test_times_of_a_film_follow_a_clock_and_are_refused_beyond_it() -> None:
     assert film_times(3, 25.0, clock=clock) == [0.75] * 3
     assert film_times(3, "sweep", (15.0, 20.0), clock) == pytest.approx([0.25, 0.375, 0.5])
     assert film_times(2, "pingpong", (0.2, 0.6)) == pytest.approx([0.2, 0.6])
-    slow = {"center": 20.0, "width": 8.0, "factor": 4.0}
-    assert film_times(9, "slow", clock=clock, slow_motion=slow) == pytest.approx(
-        slow_motion_times(9, center=0.5, width=0.4, factor=4.0)
-    )
-    with pytest.raises(ValueError, match=r"time must be sweep, .* or a number in \[10, 30\] by clock=data, got 31"):
+    with pytest.raises(
+        ValueError, match=r"time must be sweep, pingpong or a number in \[10, 30\] by clock=data, got 31"
+    ):
         film_times(3, 31.0, clock=clock)
     with pytest.raises(ValueError, match=r"time_range must be a number in \[0, 1\] by clock=run"):
         film_times(3, "sweep", (0.0, 1.5))
