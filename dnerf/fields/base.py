@@ -164,7 +164,8 @@ class Ends(NamedTuple):
 def ends_of(starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> Ends:
     """Ends of intervals between positions (..., 3), for fields that are evaluated at both, see `IntervalAware`.
 
-    Intervals that touch share an end, bit by bit; a GPU would have to wait for their number, and evaluates all.
+    Intervals that touch share an end, bit by bit; a GPU would have to wait for their number, and evaluates all. Copies
+    of the last end make their number a multiple of `PAD_TO`.
     """
     rows = [torch.cat([x, directions, times[..., None].to(x.dtype)], dim=-1).reshape(-1, 7) for x in (starts, ends)]
     number = torch.arange(times.numel(), device=times.device)
@@ -172,7 +173,8 @@ def ends_of(starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> 
     if times.is_cpu:
         is_new[1:] = (rows[0][1:] != rows[1][:-1]).any(-1)
     place = number + is_new.cumsum(0)
-    source = number.new_empty(len(number) + (int(is_new.sum()) if times.is_cpu else len(number)))
+    count = len(number) + (int(is_new.sum()) if times.is_cpu else len(number))
+    source = number.new_full((count + -count % PAD_TO,), 2 * len(number) - 1)
     source[place - 1] = number
     source[place] = number + len(number)
     joined = torch.cat(rows).index_select(0, source)

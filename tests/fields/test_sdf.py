@@ -11,7 +11,7 @@ from dnerf.core.quadrature import interval_depths
 from dnerf.core.rays import Rays, Samples
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, NeuSField, SDFField, VolSDFField
-from dnerf.fields.base import ends_of, evaluate_samples, interval_aware, surface_of
+from dnerf.fields.base import PAD_TO, ends_of, evaluate_samples, interval_aware, surface_of
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 
@@ -156,7 +156,10 @@ def test_ends_that_intervals_share_are_evaluated_once() -> None:
     starts, ends = (rays.places(packed.ray_indices, x)[0] for x in (packed.starts, packed.ends))
     directions, times = rays.directions.expand(6, 3), torch.zeros(6, dtype=torch.float64)
     shared = ends_of(starts, ends, directions, times)
-    assert len(shared.positions) == 6 + 3  # one more than intervals for each of three runs
+    num_ends = 6 + 3  # one more than intervals for each of three runs
+    assert len(shared.positions) == PAD_TO
+    assert torch.equal(shared.positions[num_ends:], ends[-1:].expand(PAD_TO - num_ends, 3))
+    assert not torch.equal(shared.positions[num_ends - 2], ends[-1])
     first, last = shared.pairs(shared.positions)
     assert torch.equal(first, starts)
     assert torch.equal(last, ends)
