@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.kernel_cases import STEP, Call, Case, Workload, backends
 from dnerf.core.cameras import Camera, Intrinsics, look_at
-from dnerf.kernels import FrameTables, add_seen, covered_places, footprints, seen_parts, shade, trace_network
+from dnerf.kernels import FrameTables, add_seen, footprints, seen_parts, shade, trace_network
 
 DISPLACEMENTS = 80  # cells per side of the displacements' lattice
 
@@ -19,17 +19,12 @@ def image_cases(work: Workload) -> list[Case]:
 
 def _cell_cases(work: Workload) -> list[Case]:
     """Of a whole grid, whatever the samples."""
-    occupied, side = work.occupancy[0], DISPLACEMENTS + 1
-    cells = occupied.nonzero().T.contiguous()
-    # Vertices of the displacements' lattice around them.
-    lows, ends = cells * DISPLACEMENTS // len(occupied), -(-(cells + 1) * DISPLACEMENTS // len(occupied)) + 1
-    covering = partial(covered_places, lows, ends, (side,) * 3)
+    occupied = work.occupancy[0]
     camera = Camera(Intrinsics.from_angle(400, 400, 0.7), look_at((2.5, 2.5, 1.5)))
     view = partial(footprints, occupied, work.box, camera.pose, camera.intrinsics.pinhole, (400, 400))
     covered = view()
     num_pixels = 0 if covered is None else len(covered.pixels)
     return [
-        Case("covered_places", "forward", backends(covering), lows.nbytes + ends.nbytes + covering().nbytes),
         Case("footprints", "forward", backends(view), occupied.nbytes + 16 * num_pixels),
     ]
 

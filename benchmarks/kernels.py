@@ -34,8 +34,8 @@ def run(settings: Settings) -> SuiteResult:
         title="Kernels: compiled, by definition, in plain torch, and the machine's limit",
         summary=(
             "Every kernel of `dnerf/kernels` is timed on the samples of rays through an occupied spherical shell, as a "
-            "training step of `experiment=fast` has them (`footprints`: a frame; `skip_distances` and "
-            "`covered_places`: a whole grid, for any samples): the compiled version (numba or oneDNN on CPUs, "
+            "training step of `experiment=fast` has them (`footprints`: a frame; `skip_distances`: "
+            "a whole grid, for any samples): the compiled version (numba or oneDNN on CPUs, "
             "Triton on a GPU), the reference that defines it, and the quickest form in plain torch that we know. "
             "Variants run in turn; medians with quartiles. On a GPU calls are replayed from a CUDA graph, as training "
             "does, where they do not wait for the device. The limit is the least number of bytes (inputs, outputs and "

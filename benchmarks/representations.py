@@ -1,10 +1,12 @@
 """Every representation of the canonical scene, trained alike: what it costs, what it scores, and how it looks."""
 
+from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
 import torch
 
+from benchmarks import profile
 from benchmarks.runs import Run, run_training
 from benchmarks.scenes import scene_overrides
 from benchmarks.suite import Settings, SuiteResult, Table
@@ -14,13 +16,14 @@ from dnerf.visualization.video import contact_sheet, write_png
 QUICK = {"scene": "static", "seconds": 2, "seeds": [0], "resolution": 32, "frames": 2, "rows": ["grid"]}
 SHEET = "representations.png"
 LAYERS = ("rgb", "normals")
+NUM_PARTS = 4  # of a step, that are named
 
 
 def run(settings: Settings) -> SuiteResult:
     """Train each representation for each seed; the first seed's models show one held-out frame and its normals."""
     options = {**settings.options, **(QUICK if settings.quick else {})}
     kinds = {name: kind for name, kind in settings.options["kinds"].items() if name in options["rows"]}
-    rows, images = [], []
+    rows, parts, images = [], [], []
     for name, kind in kinds.items():
         folders = [settings.work_dir / f"{name}-seed{seed}" for seed in options["seeds"]]
         runs = [
@@ -28,6 +31,7 @@ def run(settings: Settings) -> SuiteResult:
             for seed, folder in zip(options["seeds"], folders, strict=True)
         ]
         rows.append(_row(name, kind, runs))
+        parts.append({"representation": name, **_parts_of_a_step(settings, options, kind["overrides"])})
         images.append(_shown(settings, options, str(folders[0])))
     write_png(contact_sheet(list(zip(*images, strict=True)), list(kinds), LAYERS), settings.work_dir / SHEET)
     return SuiteResult(
@@ -43,7 +47,8 @@ def run(settings: Settings) -> SuiteResult:
                 rows,
                 "overrides: of scripts/train.py. psnr: mean over seeds, low and high the worst and best of them. "
                 "MiB: of the weights file. frame_s: one held-out frame.",
-            )
+            ),
+            Table("Where a step goes", parts, "Early steps, at 100 x 100 pixels; suite=profile says more of each."),
         ],
     )
 
@@ -64,6 +69,16 @@ def _row(name: str, kind: dict[str, Any], runs: list[Run]) -> dict[str, Any]:
         "psnr_low": min(run.psnr for run in runs),
         "psnr_high": max(run.psnr for run in runs),
     }
+
+
+def _parts_of_a_step(settings: Settings, options: dict[str, Any], words: list[str]) -> dict[str, Any]:
+    """A step's time, and the largest parts of it, see `benchmarks.profile`."""
+    scene = {name: options[name] for name in ("scene", "data_root")}
+    steps, parts, _ = profile.run(
+        replace(settings, options={**scene, "overrides": words, "warm_steps": options["profiled_after"]})
+    ).tables
+    named = {f"part {i}": f"{row['part']} {row['share']:.0%}" for i, row in enumerate(parts.rows[:NUM_PARTS], start=1)}
+    return {"step_ms": steps.rows[-1]["median_ms"], **named}
 
 
 def _shown(settings: Settings, options: dict[str, Any], folder: str) -> list[Any]:

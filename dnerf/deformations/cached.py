@@ -16,7 +16,7 @@ from dnerf.deformations.base import (
     check_positions_times,
     deformation_at_time,
 )
-from dnerf.kernels import GridLevels, MarchGrid, covered_places, grid_encode
+from dnerf.kernels import GridLevels, MarchGrid, grid_encode
 
 LEAST_ROWS = 256  # fewer take matrix libraries as long
 FEW_POINTS = 1024  # whose cells' vertices are listed, not marked in the whole lattice
@@ -170,16 +170,19 @@ class CachedAtTime(Deformation):
         Those are the occupied ones, (Gx, Gy, Gz) bool, of a grid that fills a box (2, 3), larger by `reach` (in world
         units) in every direction.
         """
-        firsts, ends = [], []
-        for axis, cell in enumerate(occupied.nonzero().unbind(-1)):
+        covered = occupied.float()
+        for axis, vertices in enumerate(self.faces):
             size, cells = occupied.shape[axis], self.levels.cells[axis]
             faces = torch.lerp(aabb[0, axis], aabb[1, axis], torch.linspace(0, 1, size + 1, device=aabb.device))
             lows, highs = (
                 (x - self.low[axis]) / self.sides[axis] * cells for x in (faces[:-1] - reach, faces[1:] + reach)
             )
-            firsts.append(lows.floor().long()[cell])
-            ends.append(highs.ceil().long()[cell] + 1)
-        around = covered_places(torch.stack(firsts[::-1]), torch.stack(ends[::-1]), self.is_known.shape)
+            number = torch.arange(len(vertices), device=aabb.device)
+            is_reached = (number >= lows.floor()[:, None]) & (number <= highs.ceil()[:, None])
+            # A cell reaches a box of vertices: how many cells reach each is a product along one axis after the other.
+            with torch.autocast(covered.device.type, enabled=False):
+                covered = torch.tensordot(covered, is_reached.float(), ([0], [0]))
+        around = (covered > 0).permute(2, 1, 0).flatten().nonzero()[:, 0]
         return around[~self.is_known.view(-1)[around]]
 
     def _padded(self, count: int) -> int:

@@ -2,7 +2,6 @@
 
 from .add_seen import add_seen
 from .backend import BACKENDS, get_backend, set_backend, use_backend
-from .covered_places import covered_places
 from .footprints import Footprints, footprints
 from .grid_encode import GridLevels, grid_encode
 from .grid_network import grid_network
@@ -19,7 +18,7 @@ from .trace_network import FrameTables, is_traced, trace_network
 
 __all__ = [
     "BACKENDS", "Footprints", "FrameTables", "GridLevels", "MarchGrid", "MarchedSamples", "SeenParts", "add_seen",
-    "covered_places", "footprints", "get_backend", "grid_encode", "grid_network", "is_bfloat16_wanted", "is_traced",
+    "footprints", "get_backend", "grid_encode", "grid_network", "is_bfloat16_wanted", "is_traced",
     "march", "march_to_size", "packed_sum", "packed_weights", "relu_layers", "seen_parts", "series_sums",
     "set_backend", "shade", "skip_distances", "trace_network", "use_backend",
 ]  # fmt: skip
