@@ -53,10 +53,9 @@ class SurroundingsBackground(Background):
         """Colours (R, 3); intervals are shifted at random in training."""
         samples = self._place(rays, generator)
         positions, directions, times = samples.locate(rays)
-        center, half = 0.5 * (self.box[0] + self.box[1]), 0.5 * (self.box[1] - self.box[0])
-        distances = ((positions - center) / half).abs().amax(-1).clamp(min=1)
-        output = self.field(contract(positions, self.box), directions, times)
-        lengths = samples.lengths / half.max() / distances.square()
+        contracted, distances = contract(positions, self.box)
+        output = self.field(contracted, directions, times)
+        lengths = samples.lengths / (0.5 * (self.box[1] - self.box[0]).max()) / distances.square()
         depths = output.density[:, :-1] * lengths[:, :-1]
         depths = torch.cat([depths, torch.full_like(depths[:, :1], torch.inf)], dim=-1)
         return (render_weights(depths, samples)[..., None] * output.rgb).sum(1)
