@@ -44,6 +44,7 @@ class SphereTracingSampler(Sampler):
 
     Raises:
         ValueError: for numbers out of range; when called, for a field without a signed distance.
+        FloatingPointError: when called, for distances that are NaN.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class SphereTracingSampler(Sampler):
             padding = -len(t) % PAD_TO  # matrix libraries compile code for every new number of rows
             numbers, t = (torch.cat([x, x[-1:].expand(padding)]) for x in (numbers, t))
             positions, _, times = rays.places(numbers, t)
-            return surface.distance(positions, times)[: len(t) - padding]
+            return _numbers(surface.distance(positions, times)[: len(t) - padding])
 
         for _ in range(self.num_steps):
             if not len(numbers):
@@ -99,8 +100,9 @@ class SphereTracingSampler(Sampler):
                 crossed = is_inside.nonzero()[:, 0]
                 t[crossed] = self._bisected(distances, numbers[crossed], before[crossed], t[crossed])
                 found.append((numbers[is_there], t[is_there]))
-            before, t = t, t + (distance / steepness).clamp(min=self.tolerance)
-            goes_on = ~is_there & (t < far[numbers])
+            ends = far[numbers]
+            before, t = t, torch.minimum(t + (distance / steepness).clamp(min=self.tolerance), ends)
+            goes_on = ~is_there & (before < ends)
             numbers, before, t = numbers[goes_on], before[goes_on], t[goes_on]
         if len(found) == 1 and not self.has_warned and bool((probed > 0).all()):
             self.has_warned = True
@@ -125,5 +127,12 @@ class SphereTracingSampler(Sampler):
         low, high = self.box.to(unit.dtype)
         places = torch.lerp(low, high, unit[:, :3])
         times = rays.times[(unit[:, 3] * len(rays)).long().clamp(max=len(rays) - 1)]
-        steepest = differences(surface, places, times, PROBE_STEP).norm(dim=-1).max()
+        steepest = _numbers(differences(surface, places, times, PROBE_STEP)).norm(dim=-1).max()
         return surface.distance(places, times), (self.safety * steepest).clamp(min=1)
+
+
+def _numbers(values: Tensor) -> Tensor:
+    """The values; FloatingPointError for NaN, of which no comparison holds: rays would pass for such that miss."""
+    if bool(values.isnan().any()):
+        raise FloatingPointError("the signed distance is NaN")
+    return values

@@ -1,6 +1,7 @@
 """Sphere tracing against exact surfaces, and against the volume that becomes them."""
 
 import logging
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -116,6 +117,28 @@ def test_rays_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
     none = sampler(Rays(empty.reshape(0, 3), empty.reshape(0, 3), empty, empty, empty), field)
     assert len(none.starts) == 0
     assert not caplog.records
+
+
+def test_a_surface_in_the_last_step_before_far_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step goes beyond both: as where the steepest place is none of those that were probed."""
+    field, ray = field_like_trained(), CAMERA.rays(0.6)[torch.tensor([528])]
+    hit = first_zero(field, ray)
+    monkeypatch.setattr(SphereTracingSampler, "_probe", lambda *_: (torch.ones(1), torch.tensor(1e-3)))
+    samples = SphereTracingSampler(BOX)(replace(ray, far=hit + 0.01), field)
+    assert (samples.points - hit).abs().max() < 1e-3  # of steps of 5e-4
+    assert len(SphereTracingSampler(BOX)(replace(ray, far=hit - 0.01), field).starts) == 0
+
+
+@pytest.mark.parametrize("at_probes", [False, True])
+def test_distances_that_are_nan_are_no_rays_that_miss(at_probes: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = field_like_trained()
+    if at_probes:
+        monkeypatch.setattr(sphere_tracing, "differences", lambda surface, positions, *_: positions * torch.nan)
+    else:  # at none of the probes, as a place that only some rays come to
+        monkeypatch.setattr(SphereTracingSampler, "_probe", lambda *_: (torch.ones(1), torch.ones(())))
+        monkeypatch.setattr(field, "distance", lambda positions, times: torch.where(times > 0, torch.nan, 0.5 + times))
+    with pytest.raises(FloatingPointError, match="the signed distance is NaN"):
+        SphereTracingSampler(BOX)(CAMERA.rays(0.6), field)
 
 
 def test_a_distance_without_a_zero_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
