@@ -164,7 +164,7 @@ class Samples:
             self.starts.index_select(0, numbers), self.ends.index_select(0, numbers), self.num_rays,
             ray_indices=self.ray_indices.index_select(0, numbers),
             points=None if self.points is None else self.points.index_select(0, numbers),
-            ray_offsets=torch.searchsorted(numbers, self.offsets),
+            ray_offsets=torch.searchsorted(numbers, self.offsets), is_opaque=self.is_opaque,
         )  # fmt: skip
 
     def split(self, counts: int | Tensor) -> "Samples":
@@ -223,7 +223,7 @@ class Samples:
         samples = Samples(
             torch.where(chosen.is_filled, torch.lerp(starts, ends, chosen.part / length), 0),
             torch.where(chosen.is_filled, torch.lerp(starts, ends, (chosen.part + 1) / length), 0), self.num_rays,
-            ray_indices=chosen.rays, ray_offsets=chosen.offsets,
+            ray_indices=chosen.rays, ray_offsets=chosen.offsets, is_opaque=self.is_opaque,
             is_placed=is_placed if self.is_placed is None else is_placed & self.is_placed,
         )  # fmt: skip
         return samples, chosen.wanted

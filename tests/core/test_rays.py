@@ -108,6 +108,15 @@ def test_packed_samples_are_chosen_from_ray_by_ray() -> None:
     assert last.offsets.tolist() == [0, 1, 1, 1, 2]
 
 
+def test_opaque_samples_stay_opaque_when_they_are_chosen_split_or_fitted() -> None:
+    packed = Samples(torch.zeros(2), torch.ones(2), 2, ray_indices=torch.tensor([0, 1]), is_opaque=True)
+    none = replace(packed, is_opaque=False)
+    for samples, expected in ((packed, True), (none, False)):
+        made = (samples.kept(torch.ones(2, dtype=torch.bool)), samples.chosen(torch.tensor([1])), samples.padded(4))
+        for other in (*made, samples.split(2), samples.fitted(torch.tensor([1, 2]), 4)[0]):
+            assert other.is_opaque is expected
+
+
 @given(st.integers(1, 5))
 def test_split_intervals_fill_what_they_were_cut_from(count: int) -> None:
     starts = torch.tensor([0.0, 1.0, 5.0])
