@@ -89,8 +89,11 @@ class HasRoughness(ABC):
     """A part that keeps values on lattices, whose differences between neighbours may be given a price."""
 
     @abstractmethod
-    def roughness(self) -> tuple[Tensor, Tensor]:
-        """Of neighbours in space, and of second differences in time (zero without time): scalars."""
+    def roughness(self, turn: Tensor | int = 0) -> tuple[Tensor, Tensor]:
+        """Of neighbours in space, and of second differences in time (zero without time): scalars.
+
+        Of large lattices only at some places, others at every turn, a number ().
+        """
 
 
 @dataclass(frozen=True)

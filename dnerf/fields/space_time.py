@@ -81,7 +81,7 @@ class LatticeFeatures(SpaceTimeFeatures, HasRoughness):
     def _joined(self, values: list[Tensor]) -> Tensor:
         """Features (N, L F) of those of each table (N, L F)."""
 
-    def roughness(self) -> tuple[Tensor, Tensor]:
+    def roughness(self, turn: Tensor | int = 0) -> tuple[Tensor, Tensor]:
         """Mean squared differences of neighbours in space, and second differences in time, of all tables; scalars."""
         space, time = self.low.new_zeros(()), self.low.new_zeros(())
         for some, table, levels in zip(self.axes, self.tables, self.levels, strict=True):

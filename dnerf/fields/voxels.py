@@ -20,6 +20,7 @@ from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
 COPIES = 8  # of each number in training: weight, gradient, Adam's moments, what recovery keeps of them, the average
 LAYERS = 16  # of a table that roughness looks at: at all of 256 cells each way, it takes as long as fifty steps
+STRIDE = 7919  # between the first layers of two turns, modulo how many there are: a prime visits them all
 
 
 class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Scheduled):
@@ -140,18 +141,17 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
             colors = colors + (terms * basis).sum(2)
         return FieldOutput(density.reshape(times.shape), torch.sigmoid(colors).reshape(positions.shape))
 
-    def roughness(self) -> tuple[Tensor, Tensor]:
+    def roughness(self, turn: Tensor | int = 0) -> tuple[Tensor, Tensor]:
         """Mean squared differences of neighbours, of all open tables, and zero: nothing changes with time.
 
-        Of large tables at some neighbouring layers, others at every call, drawn from torch's own generator.
+        Of large tables at some neighbouring layers, others at every turn.
         """
         total = self.low.new_zeros(())
         for tables in (self.tables, self.harmonics):
             for table, levels in zip(tables[: self.num_open], self.levels):
                 x, y, z = levels.cells
                 count = min(LAYERS, z + 1)
-                first = (torch.rand((), device=table.device) * (z + 2 - count)).long()
-                layers = first + torch.arange(count, device=table.device)
+                layers = turn * STRIDE % (z + 2 - count) + torch.arange(count, device=table.device)
                 values = table.view(z + 1, y + 1, x + 1, -1).index_select(0, layers)
                 total = total + sum(values.diff(dim=axis).square().mean() for axis in range(3))
         return total, torch.zeros_like(total)

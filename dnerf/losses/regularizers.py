@@ -139,6 +139,7 @@ class SmoothnessLoss(Loss):
         super().__init__(weight, every=every)
         check_positive("time_weight", time_weight, allow_zero=True)
         self.time_weight = time_weight
+        self.num_calls = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
     def check(self, model: Renderer) -> None:
         """Needs a part with lattices, see `HasRoughness`."""
@@ -149,8 +150,9 @@ class SmoothnessLoss(Loss):
         """Roughness in space, plus that in time times its factor."""
         total = rendering.rgb.new_zeros(())
         for part in self._parts(model):
-            in_space, in_time = part.roughness()
+            in_space, in_time = part.roughness(self.num_calls)
             total = total + in_space + self.time_weight * in_time
+        self.num_calls.add_(1)  # a tensor: graphs that replay steps go on counting
         return total
 
     def _parts(self, model: Renderer) -> list[HasRoughness]:
@@ -192,7 +194,7 @@ class TimeEmbeddingLoss(Loss):
         """Mean squared differences; of the rendering only the number of rays matters."""
         total = rendering.rgb.new_zeros(())
         self.to(rendering.rgb.device)
-        self.num_rays.add_(len(rendering.rgb))  # a tensor: graphs that replay steps go on counting
+        self.num_rays.add_(len(rendering.rgb))  # a tensor, as above
         for part in self._parts(model):
             total = total + self._growth(part) * part.roughness()
         return total

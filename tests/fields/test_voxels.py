@@ -204,6 +204,21 @@ def test_roughness_is_of_differences_between_neighbours() -> None:
     assert float(in_time.detach()) == 0
 
 
+def test_roughness_looks_at_every_layer_in_its_turn_whatever_was_drawn_elsewhere() -> None:
+    field = VoxelField(BOX, (40,), view_degree=0)
+    (table,), (_, _, z) = field.tables, field.levels[0].cells
+    counts = torch.zeros(z + 1)
+    with torch.no_grad():
+        table.copy_(torch.arange(4.0) * torch.arange(len(table))[:, None] ** 2)  # no layer without a gradient
+    for turn in range(z + 2 - 16):  # layers at once
+        table.grad = None
+        field.roughness(torch.tensor(turn))[0].backward()
+        assert table.grad is not None
+        counts += table.grad.view(z + 1, -1).abs().sum(1) > 0
+    assert counts.tolist() == [min(i + 1, z + 1 - i, 16, z + 2 - 16) for i in range(z + 1)]
+    assert len({float(field.roughness(7)[0].detach()) for _ in range(9)}) == 1
+
+
 @pytest.mark.parametrize(("settings", "message"), [
     ({"resolutions": ()}, "resolutions must ascend, one level at least, got []"),
     ({"resolutions": (8, 8)}, "resolutions must ascend, one level at least, got [8, 8]"),

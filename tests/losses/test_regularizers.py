@@ -11,7 +11,7 @@ from torch import Tensor
 from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.rays import Samples
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
-from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes
+from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes, VoxelField
 from dnerf.losses import Batch, Loss, PhotometricLoss, SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
@@ -216,6 +216,18 @@ def test_rough_volumes_cost() -> None:
         SmoothnessLoss().check(RENDERER)
     with pytest.raises(ValueError, match="time_weight must be >= 0"):
         SmoothnessLoss(time_weight=-1.0)
+
+
+def test_layers_of_voxels_that_cost_go_on_where_a_loss_that_is_loaded_was() -> None:
+    field = VoxelField(BOX, (40,), view_degree=0)
+    with torch.no_grad():
+        field.tables[0].copy_(torch.arange(len(field.tables[0]))[:, None] ** 2)
+    renderer, rgb = Renderer(field, StratifiedSampler(4)), torch.zeros(2, 3)
+    loss, resumed = SmoothnessLoss(), SmoothnessLoss()
+    costs = [loss(shown(rgb), of(rgb), renderer).item() for _ in range(4)]
+    assert len(set(costs)) == 4
+    resumed.load_state_dict(loss.state_dict())
+    assert resumed(shown(rgb), of(rgb), renderer).item() == loss(shown(rgb), of(rgb), renderer).item()
 
 
 def of_embeddings(values: list[float]) -> tuple[Renderer, torch.nn.Parameter]:
