@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 import yaml
@@ -216,11 +216,23 @@ def _complaint(make: Any, given: Mapping[str, Any], place: str) -> str:
     takes_any = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values())
     for name in given:
         if name not in named and not takes_any:
-            return f"{_joined(place, name)} is none of {make.__name__}'s arguments: {', '.join(named)}"
+            said = f"{_joined(place, name)} is none of {make.__name__}'s arguments: {', '.join(named)}"
+            others = _who_takes(name, make)
+            return f"{said}; {', '.join(others)} would take it" if others else said
     for name in named:
         if name not in given and parameters[name].default is inspect.Parameter.empty:
             return f"{_joined(place, name)} is missing: {make.__name__} needs it"
     return ""
+
+
+def _who_takes(argument: str, make: Any) -> list[str]:
+    """Other classes, of the package that a class lies in, with an argument of that name."""
+    there = vars(importlib.import_module(make.__module__.rpartition(".")[0] or make.__module__))
+    return [
+        name for name, other in there.items()
+        if isinstance(other, type) and not inspect.isabstract(other)
+        and argument in inspect.signature(cast(Any, other).__init__).parameters
+    ]  # fmt: skip
 
 
 def _plain_yaml(path: Path) -> Any:

@@ -80,6 +80,14 @@ def test_an_error_names_its_place(change: dict[str, Any], said: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("argument", "end"), [("space_time", "; GridField, PlanesField would take it"), ("nosuch", "")]
+)
+def test_an_argument_of_others_names_who_takes_it(argument: str, end: str) -> None:
+    with pytest.raises(ValueError, match=f"^field.{argument} is none of VoxelField's arguments: .*, max_gib{end}$"):
+        build({"_target_": "dnerf.fields.VoxelField", "box": BOX, argument: None}, "field")
+
+
+@pytest.mark.parametrize(
     "target",
     [
         "os.system", "builtins.exec", "", "dnerf", 3, None, "dnerf.core.files.write_text", "dnerf.core.files.os.system",
