@@ -1,5 +1,6 @@
 """A run's surface as an animated glTF, or a PLY or OBJ file for each frame: python scripts/mesh.py run=runs/mutant"""
 
+import sys
 import time
 from pathlib import Path
 
@@ -9,7 +10,9 @@ from omegaconf import DictConfig
 
 from dnerf.core.checks import check_choice
 from dnerf.fields import RadianceField, TimeDependence
-from dnerf.meshing import FORMATS, Mesh, extract_surface, mesh_through_time, write_gltf, write_meshes
+from dnerf.meshing import FORMATS, Mesh, extract_surface, mesh_through_time, share_on_box, write_gltf, write_meshes
+
+CUT = 1e-3  # share of the surface on the box's sides from which on a line says so
 
 
 def main(config: DictConfig) -> None:
@@ -23,12 +26,15 @@ def main(config: DictConfig) -> None:
     renderer = load_renderer(config.run, saved, resolve_device(config.device))
     begun = time.perf_counter()
     start = sum(scene.times) / 2 if config.time is None else config.time
+    on_box: list[float] = []
 
     def extract(field: RadianceField, time: float) -> Mesh:
-        return extract_surface(
+        mesh = extract_surface(
             field, time, box=scene.world.box, resolution=config.resolution, level=config.level,
             min_share=config.min_share, close_gaps=config.close_gaps,
         )  # fmt: skip
+        on_box.append(share_on_box(mesh, scene.world.box))
+        return mesh
 
     count = config.num_frames
     times = torch.linspace(*scene.times, count) if count > 1 else torch.tensor([start])
@@ -45,13 +51,21 @@ def main(config: DictConfig) -> None:
     folder, similarity = Path(config.output or Path(config.run) / "meshes"), scene.world.similarity
     for format in formats:
         if format == "glb" and moving is not None:
-            settings = {"fps": config.fps, "every": config.key_every, "interpolation": config.interpolation}
-            path = write_gltf(moving, folder / "mesh.glb", similarity=similarity, **settings)
+            path = write_gltf(
+                moving, folder / "mesh.glb", fps=config.fps, every=config.key_every, lit=config.lit,
+                interpolation=config.interpolation, similarity=similarity,
+            )  # fmt: skip
         else:
             own = (extract(renderer.field, time) for time in times.tolist())
             frames = own if moving is None else map(moving.frame, range(len(moving.times)))
             path = write_meshes(frames, folder / format, format, similarity=similarity)
         print(f"{format}: {path}")
+    if max(on_box) > CUT:
+        print(
+            f"warning: {max(on_box):.1%} of the surface lies on the sides of the run's box, which cuts it; "
+            "a larger data.box in training would not",
+            file=sys.stderr,
+        )
     print(f"{time.perf_counter() - begun:.1f} s")
 
 

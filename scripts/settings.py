@@ -95,7 +95,7 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
     },
     "mesh": {
         "format": SEVERAL, "time": NUMBER.or_null(), "resolution": POSITIVE, "level": NUMBER.or_null(),
-        "min_share": NUMBER, "close_gaps": NUMBER, "key_every": POSITIVE, "interpolation": TEXT,
+        "min_share": NUMBER, "close_gaps": NUMBER, "key_every": POSITIVE, "interpolation": TEXT, "lit": TRUTH,
     },
     "make_dataset": {
         "out": TEXT, "film": TEXT.or_null(), "num_val": POSITIVE, "num_test": POSITIVE, "resolution": POSITIVE,

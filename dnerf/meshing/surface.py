@@ -114,6 +114,14 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     return safe_normalize(result)
 
 
+def share_on_box(mesh: Mesh, box: Sequence[Sequence[float]] | Tensor) -> float:
+    """Share of a mesh's area that lies in the sides of a box: where `extract_surface` closes what its box cuts."""
+    corners, places = as_box(box).cpu(), mesh.vertices[mesh.faces]
+    is_near = (places[:, :, None] - corners).abs() <= 1e-4 * (corners[1] - corners[0]).max()  # (F, 3, 2, 3)
+    areas = torch.linalg.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]).norm(dim=-1)
+    return float((areas * is_near.all(1).flatten(1).any(1)).sum() / areas.sum())
+
+
 def imported(module: str) -> Any:
     """A module of the extra; ValueError if it is not installed."""
     try:

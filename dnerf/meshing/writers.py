@@ -65,13 +65,13 @@ def write_meshes(
 
 def write_gltf(
     animation: Animation, path: str | Path, *, fps: float = 20.0, every: int = 1,
-    interpolation: str = "linear", similarity: Similarity = IDENTITY,
+    interpolation: str = "linear", lit: bool = False, similarity: Similarity = IDENTITY,
 ) -> Path:  # fmt: skip
     """Write a mesh that moves as one binary glTF 2.0 file; returns the path.
 
     The mesh is that of the first frame. Every key frame behind it is a morph target (differences of positions), and
     one animation fades their weights: at a key frame's time its weight is one, the others' are zero. Colours are
-    light as the images show it, so the material is unlit; glTF wants them linear, images are sRGB.
+    light as the images show it, so the material is unlit by default; glTF wants them linear, images are sRGB.
 
     Args:
         animation: in world units.
@@ -79,6 +79,8 @@ def write_gltf(
         fps: frames in a second: frame i stands at i / fps.
         every: one key frame of so many frames, the last one among them.
         interpolation: between key frames, "linear" or "step".
+        lit: whether the viewer's lamps shade the mesh. It then has normals at each key frame, which takes twice the
+            bytes; otherwise they stay those of the first frame, which no unlit material looks at.
         similarity: see `write_meshes`.
 
     Raises:
@@ -91,7 +93,7 @@ def write_gltf(
     check_choice("interpolation", interpolation, ("linear", "step"))
     keys = [*range(0, len(animation.times) - 1, every), len(animation.times) - 1]
     first = own_units(animation.frame(0), similarity)
-    if (len(keys) + 3) * 12 * len(first.vertices) + 12 * len(first.faces) > MOST_BYTES:
+    if ((1 + lit) * len(keys) + 3) * 12 * len(first.vertices) + 12 * len(first.faces) > MOST_BYTES:
         raise ValueError(f"every must leave a file of less than 4 GiB, got {len(keys)} key frames; choose a larger one")
     lib, blob = imported("pygltflib"), bytearray()
     gltf = lib.GLTF2(asset=lib.Asset(version="2.0", generator="dnerf"), scene=0, scenes=[lib.Scene(nodes=[0])])
@@ -115,14 +117,18 @@ def write_gltf(
         COLOR_0=add(_linear_colours(first.rgb), VERTICES),
     )  # fmt: skip
     indices = add(first.faces.reshape(-1, 1).to(torch.uint32), INDICES)
-    frames = (own_units(animation.frame(key), similarity).vertices for key in keys[1:])
-    targets = [{"POSITION": add(moved - first.vertices, VERTICES)} for moved in frames]
+    targets = []
+    for moved in (own_units(animation.frame(key), similarity) for key in keys[1:]):
+        changes = {"POSITION": moved.vertices - first.vertices} | (
+            {"NORMAL": moved.normals - first.normals} if lit else {}
+        )
+        targets.append({name: add(change, VERTICES) for name, change in changes.items()})
     gltf.meshes = [lib.Mesh(name="surface", weights=[0.0] * len(targets), primitives=[
         lib.Primitive(attributes=attributes, indices=indices, material=0, targets=targets)
     ])]  # fmt: skip
     matte = lib.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0)
-    gltf.materials = [lib.Material(pbrMetallicRoughness=matte, extensions={UNLIT: {}}, doubleSided=True)]
-    gltf.extensionsUsed = [UNLIT]
+    gltf.materials = [lib.Material(pbrMetallicRoughness=matte, extensions={} if lit else {UNLIT: {}}, doubleSided=True)]
+    gltf.extensionsUsed = [] if lit else [UNLIT]
     turn = imported("scipy.spatial.transform").Rotation.from_matrix(TO_Y_UP)
     turn = turn * imported("scipy.spatial.transform").Rotation.from_matrix(similarity.rotation)
     gltf.nodes = [

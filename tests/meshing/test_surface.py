@@ -10,7 +10,7 @@ from exact_shapes import BOX, CENTER, ExactSurface, Fog, ball, box, capsule, tor
 
 from dnerf.deformations import IdentityDeformation
 from dnerf.fields import DeformedField
-from dnerf.meshing import Mesh, extract_surface, surface, vertex_normals
+from dnerf.meshing import Mesh, extract_surface, share_on_box, surface, vertex_normals
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
@@ -146,6 +146,17 @@ def test_small_parts_are_left_out():
 
     counts = [solid(extract(ExactSurface(two), resolution=48, min_share=share)).body_count for share in (0.0, 0.1)]
     assert counts == [2, 1]
+
+
+def test_what_the_box_cuts_is_measured():
+    """A ball through one side: a disc of the box and a dome, both of known area."""
+    whole = extract(ExactSurface(ball), resolution=48)
+    assert share_on_box(whole, BOX) == 0
+    low, high = torch.tensor(BOX)
+    cut = torch.stack([low, high.index_fill(0, torch.tensor(0), float(CENTER[0]) + 0.3)])
+    disc, dome = math.pi * (0.5**2 - 0.3**2), 2 * math.pi * 0.5 * 0.8
+    share = share_on_box(extract(ExactSurface(ball), box=cut, resolution=96), cut)
+    assert share == pytest.approx(disc / (disc + dome), rel=0.05)  # less a rim of a cell
 
 
 REFUSED = [

@@ -61,7 +61,9 @@ def read_by_the_rules(path):
     assert {len(arrays[i]) for i in (*primitive["attributes"].values(), *places)} == {len(arrays[places[0]])}
     assert arrays[primitive["indices"]].max() < len(arrays[places[0]])
     assert np.abs(np.linalg.norm(arrays[primitive["attributes"]["NORMAL"]], axis=1) - 1).max() < 1e-4
-    assert set(gltf.get("extensionsUsed", [])) == {"KHR_materials_unlit"}
+    is_lit = "NORMAL" in (primitive.get("targets") or [{}])[0]
+    assert set(gltf.get("extensionsUsed", [])) == (set() if is_lit else {"KHR_materials_unlit"})
+    assert gltf["materials"][0].get("extensions", {}).keys() == set(gltf.get("extensionsUsed", []))
     assert "extensionsRequired" not in gltf
     return gltf, arrays, primitive, [arrays[i] for i in places]
 
@@ -85,6 +87,15 @@ def test_animated_gltf_keeps_the_rules_and_is_the_frames_at_its_keys(animation, 
         moved = base + sum(weight * target for weight, target in zip(row, targets, strict=True))
         exact = OWN.positions_from_world(animation.positions[key])
         np.testing.assert_allclose(moved, exact, atol=2e-6)  # of float32, in units of some 5
+
+
+def test_lit_gltf_has_the_normals_of_its_key_frames(animation, tmp_path):
+    gltf, arrays, primitive, _ = read_by_the_rules(write_gltf(animation, tmp_path / "mesh.glb", every=2, lit=True))
+    assert "KHR_materials_unlit" not in json.dumps(gltf)
+    first = arrays[primitive["attributes"]["NORMAL"]]
+    for key, target in zip((2, 4, 5), primitive["targets"], strict=True):
+        np.testing.assert_allclose(first + arrays[target["NORMAL"]], animation.frame(key).normals, atol=1e-6)
+    assert np.abs(arrays[target["NORMAL"]]).max() > 0.1  # it turns
 
 
 def test_gltf_is_turned_so_that_up_is_y(animation, tmp_path):

@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -343,13 +344,15 @@ def test_wrong_input_is_named(work, script, arguments, named):
 
 
 def test_the_surface_of_a_run_is_written(work, capsys):
-    call("mesh", "run=run", "format=[glb,ply,obj]", "num_frames=3", "resolution=12", "level=5")
+    call("mesh", "run=run", "format=[glb,ply,obj]", "num_frames=3", "resolution=12", "level=5", "lit=true")
     names = sorted(path.name for path in (work / "run" / "meshes").rglob("*.*"))
     frames = [f"mesh_{i:05d}" for i in range(3)]
     assert names == sorted(["mesh.glb", *(f"{frame}.{format}" for frame in frames for format in ("ply", "obj"))])
-    said = capsys.readouterr().out
+    said, warned = capsys.readouterr()
     assert "3 frames; 0 vertices left out" in said
     assert "the canonical field changes with time: shape and colours are those of time 0.5" in said
+    assert re.match(r"warning: \d+\.\d% of the surface lies on the sides of the run's box, which cuts it", warned)
+    assert warned.count("\n") == 1
 
 
 def test_what_is_refused_leaves_nothing(work):
