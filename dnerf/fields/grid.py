@@ -37,7 +37,8 @@ class GridField(HeadedField):
         self, box: Sequence[Sequence[float]], resolutions: Sequence[int] = (16, 32, 64, 128), num_features: int = 8, *,
         max_rows: int = 1 << 17, hidden_features: int = 64, num_layers: int = 2, time_frequencies: int | None = None,
         temporal_terms: int = 1, space_time: SpaceTimeFeatures | None = None, view_degree: int | None = None,
-        density_activation: str = "exp", density_shift: float = -1.0, window_end: float | None = None,
+        one_color: bool = False, density_activation: str = "exp", density_shift: float = -1.0,
+        window_end: float | None = None,
     ) -> None:  # fmt: skip
         check_positive("num_features", num_features)
         for resolution in resolutions:
@@ -48,8 +49,8 @@ class GridField(HeadedField):
         super().__init__(
             levels.num_levels, num_features, hidden_features=hidden_features, num_layers=num_layers,
             time_frequencies=time_frequencies, temporal_terms=temporal_terms, space_time=space_time,
-            view_degree=view_degree, density_activation=density_activation, density_shift=density_shift,
-            window_end=window_end,
+            view_degree=view_degree, one_color=one_color, density_activation=density_activation,
+            density_shift=density_shift, window_end=window_end,
         )  # fmt: skip
         self.levels = levels
         self.low = nn.Buffer(corners[0], persistent=False)

@@ -44,6 +44,8 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         view_degree: degree, 0 to 4, of spherical harmonics of the direction that colour follows before its activation,
             beside the series in time: a ray sees one of these functions all along, so images cost hardly more than
             matte ones. None or 0 for matte.
+        one_color: whether colour is the same everywhere, as of smoke; it may still follow time and direction. Then only
+            density explains what is bright and what is dim, as in tomography.
         density_activation: "softplus" or "exp".
         density_shift: added before the activation; negative for a thin start.
         window_end: fraction of training, in (0, 1], at which every level is in; finer levels fade in one after the
@@ -57,8 +59,8 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
     def __init__(
         self, num_levels: int, num_features: int, *, hidden_features: int = 64, num_layers: int = 2,
         time_frequencies: int | None = None, temporal_terms: int = 1, space_time: SpaceTimeFeatures | None = None,
-        view_degree: int | None = None, density_activation: str = "exp", density_shift: float = -1.0,
-        window_end: float | None = None,
+        view_degree: int | None = None, one_color: bool = False, density_activation: str = "exp",
+        density_shift: float = -1.0, window_end: float | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         check_positive("temporal_terms", temporal_terms)
@@ -73,6 +75,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         self.space_time = space_time
         self.temporal_terms = temporal_terms
         self.view_degree = view_degree or 0
+        self.one_color = one_color
         self.orders = nn.Buffer(torch.arange(temporal_terms), persistent=False)
         in_features = num_features * num_levels
         if self.encode_times is not None:
@@ -148,9 +151,12 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
 
     @property
     def _last(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias of the head's last layer."""
+        """Weight and bias of the head's last layer; of one colour only the biases count."""
         assert self.head.output is not None
-        return self.head.output.weight, self.head.output.bias
+        weight, bias = self.head.output.weight, self.head.output.bias
+        if self.one_color:
+            weight = torch.cat([weight[: self.temporal_terms], torch.zeros_like(weight[self.temporal_terms :])])
+        return weight, bias
 
     def _activated(self, raw: Tensor) -> Tensor:
         return activate_density(raw, self.density_activation, self.density_shift)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 
 from dnerf.core.geometry import ray_box
-from dnerf.data.background_check import background_color
+from dnerf.data.background_check import SAME_LEVELS, background_color
 from dnerf.data.bounds import fit_box
-from dnerf.data.carving import Silhouettes
+from dnerf.data.carving import EVERY_PIXEL, Silhouettes
 from dnerf.data.frames import Frames
 from dnerf.data.pixel_layout import evenly_spread
 
@@ -18,6 +18,8 @@ NUM_DISTANCES = 64  # along each ray
 REACH = 1  # blocks of pixels by which outlines may be off
 NOT_CLEAR = 2  # alpha, of 255, from which a pixel shows something, be it fog
 AGREEMENT = 0.98  # share of the views in which one position is not empty, so that a body at rest explains a ray
+MAX_CAMERAS = 8  # that do not move: more tell what is thin from what is dark
+MIXTURES = 0.995  # share of the pixels
 CLEAR_SHARE = 0.01  # of rays without such a position: fewer may be faults of single images
 
 
@@ -71,6 +73,37 @@ class SurroundingsEvidence(Evidence):
         if background_color(frames) is not None:
             return Finding("alone", "the images have one plain colour behind")
         return Finding("surrounded", "the images show something everywhere")
+
+
+class ColorsEvidence(Evidence):
+    """Whether what is seen is of one colour, as smoke is: candidates "one" and "many".
+
+    Before a plain background what is thin looks like what is dark. Few cameras that stand still cannot tell the two
+    apart: each image is explained by a cloud of its own. If all pixels are mixtures of the background and one colour,
+    density alone explains them, as in HyFluid's code (arXiv 2312.06561). A grey body is such a mixture, too, so one
+    colour stands until a trial says otherwise.
+    """
+
+    def find(self, frames: Frames) -> Finding:
+        """See `Evidence.find`."""
+        behind = None if frames.is_transparent else background_color(frames)
+        if behind is None:
+            return Finding("many", "the images have alpha, or show something everywhere")
+        cameras = len(frames.poses.unique(dim=0))
+        if cameras > MAX_CAMERAS:
+            return Finding("many", f"{cameras} viewpoints tell what is thin from what is dark")
+        if mixture_share(frames, behind) < MIXTURES:
+            return Finding("many", "the images have colours that no single one makes")
+        return Finding("one", "all pixels are mixtures of the background and one colour", is_certain=False)
+
+
+def mixture_share(frames: Frames, behind: torch.Tensor) -> float:
+    """The share of pixels that are mixtures of a colour (3,) in [0, 1] behind and one other, up to `SAME_LEVELS`."""
+    images = (frames.stored_image(i)[::EVERY_PIXEL, ::EVERY_PIXEL, :3] for i in evenly_spread(len(frames), MAX_VIEWS))
+    away = torch.cat([image.flatten(0, 1) for image in images]).float() - 255 * behind
+    color = torch.linalg.eigh(away.T @ away)[1][:, -1]
+    color = color * torch.sign((away @ color).sum())
+    return float(((away - (away @ color).clamp(min=0)[:, None] * color).norm(dim=-1) <= SAME_LEVELS).float().mean())
 
 
 def unexplained_share(frames: Frames) -> float:

@@ -121,6 +121,26 @@ def test_colour_follows_harmonics_of_the_direction_and_cosines_of_time_and_begin
     torch.testing.assert_close(density, field(places, -seen_from, times).density, rtol=1e-12, atol=0)
 
 
+def test_one_colour_is_the_same_everywhere_while_density_differs_and_follows_time_and_direction() -> None:
+    field = small(temporal_terms=3, view_degree=1, one_color=True)
+    for parameter in field.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    places, seen_from = torch.rand(50, 3) + torch.tensor([0.0, 0.0, 3.0]), directions(2)
+    first, later, aside = (
+        field(places, direction.expand(50, 3), torch.full((50,), time))
+        for time, direction in ((0.2, seen_from[0]), (0.9, seen_from[0]), (0.2, seen_from[1]))
+    )
+    assert float(first.density.detach().std()) > 1e-2
+    for output in (first, later, aside):
+        torch.testing.assert_close(output.rgb, output.rgb[:1].expand(50, 3))
+    assert float((first.rgb - later.rgb)[0].detach().abs().max()) > 1e-2
+    assert float((first.rgb - aside.rgb)[0].detach().abs().max()) > 1e-2
+    first.rgb.sum().backward()
+    assert field.head.output is not None
+    assert not field.head.output.weight.grad.any()  # type: ignore[union-attr]
+    assert field.head.output.bias.grad[3:].any()  # type: ignore[index]
+
+
 @pytest.mark.parametrize(("box", "options", "message"), [
     ([[0, 0, 0], [1, 0, 1]], {}, "box must have finite corners"),
     (BOX, {"num_features": 0}, "num_features must be > 0"), (BOX, {"temporal_terms": 0}, "temporal_terms must be > 0"),
@@ -189,7 +209,8 @@ def test_what_depends_on_time_alone_is_summed_up_for_images() -> None:
         frozen.density(torch.zeros(4, 3), torch.full((4,), 0.5))
 
 
-@pytest.mark.parametrize("options", [{}, {"view_degree": 2}, {"view_degree": 1, "time_frequencies": 2}])
+@pytest.mark.parametrize("options", [{}, {"view_degree": 2}, {"view_degree": 1, "time_frequencies": 2},
+                                     {"view_degree": 2, "one_color": True}])  # fmt: skip
 def test_tables_for_the_frame_kernel_are_all_that_the_field_shows(options: dict) -> None:
     field = small(temporal_terms=3, window_end=1.0, **options)
     field.set_progress(0.6)

@@ -13,7 +13,18 @@ from small_runs import BOX, small_frames, small_renderer, small_trainer, weights
 from dnerf.core.backgrounds import RandomBackground
 from dnerf.data import Frames, SyntheticData
 from dnerf.fields import GridField
-from dnerf.planning import Decision, Evidence, Finding, MotionEvidence, Part, Plan, SurroundingsEvidence, make_plan
+from dnerf.planning import (
+    ColorsEvidence,
+    Decision,
+    Evidence,
+    Finding,
+    MotionEvidence,
+    Part,
+    Plan,
+    SurroundingsEvidence,
+    make_plan,
+)  # fmt: skip
+from dnerf.planning.evidence import mixture_share
 from dnerf.planning.plan import fingerprint, load_plan
 from dnerf.planning.planner import LEAST_STEPS
 from dnerf.planning.trials import Contender, Effort, HeldOut, contest, gain, split_frames
@@ -176,6 +187,29 @@ def test_images_that_show_something_everywhere_have_surroundings() -> None:
     assert SurroundingsEvidence().find(opaque).choice == "alone"  # before white, or black
     noise = torch.randint(256, opaque.images.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     assert SurroundingsEvidence().find(replace(opaque, images=noise)).choice == "surrounded"
+
+
+def test_smoke_of_one_colour_before_few_cameras_is_told_from_all_else() -> None:
+    """Mixtures of one colour and the background; not of two, not with alpha, and not where many cameras look."""
+    frames, behind = frames_of("walker", 12, 16), torch.tensor([0.2, 0.4, 0.6])
+    thickness = torch.rand(12, 16, 16, 1, generator=torch.Generator().manual_seed(0))
+    thickness[:, [0, -1]] = thickness[:, :, [0, -1]] = 0
+    rig = frames.poses[torch.arange(12) % 4]
+
+    def before_plain(colors: torch.Tensor, poses: torch.Tensor = rig) -> Frames:
+        images = (255 * torch.lerp(behind.expand(12, 16, 16, 3), colors, thickness)).round().to(torch.uint8)
+        return replace(frames, images=images, poses=poses, background=None)
+
+    smoke = torch.tensor([0.9, 0.8, 0.5]).expand(12, 16, 16, 3)
+    two = torch.where(torch.arange(16)[:, None] < 8, smoke, torch.tensor([0.1, 0.9, 0.2]))
+    both_sides = torch.where(torch.arange(16)[:, None] < 8, smoke, 2 * behind - smoke).clamp(0, 1)
+    assert ColorsEvidence().find(before_plain(smoke)).choice == "one"
+    for other in (two, both_sides):
+        assert ColorsEvidence().find(before_plain(other)).choice == "many"
+    assert ColorsEvidence().find(before_plain(smoke, frames.poses)).choice == "many"  # twelve viewpoints
+    assert ColorsEvidence().find(frames).choice == "many"  # with alpha
+    assert mixture_share(before_plain(smoke), behind) == 1
+    assert mixture_share(before_plain(two), behind) < 0.8
 
 
 def test_trials_of_several_parts_share_one_budget() -> None:
