@@ -80,8 +80,8 @@ class ColorsEvidence(Evidence):
 
     Before a plain background what is thin looks like what is dark. Few cameras that stand still cannot tell the two
     apart: each image is explained by a cloud of its own. If all pixels are mixtures of the background and one colour,
-    density alone explains them, as in HyFluid's code (arXiv 2312.06561). A grey body is such a mixture, too, so one
-    colour stands until a trial says otherwise.
+    density alone explains them, as in HyFluid's code (arXiv 2312.06561). That is certain here, since trials compare on
+    frames of the same cameras, where clouds of their own do well. A grey body before black is taken for smoke, too.
     """
 
     def find(self, frames: Frames) -> Finding:
@@ -94,7 +94,7 @@ class ColorsEvidence(Evidence):
             return Finding("many", f"{cameras} viewpoints tell what is thin from what is dark")
         if mixture_share(frames, behind) < MIXTURES:
             return Finding("many", "the images have colours that no single one makes")
-        return Finding("one", "all pixels are mixtures of the background and one colour", is_certain=False)
+        return Finding("one", f"all pixels are mixtures of the background and one colour, for {cameras} cameras")
 
 
 def mixture_share(frames: Frames, behind: torch.Tensor) -> float:

@@ -208,6 +208,9 @@ def test_smoke_of_one_colour_before_few_cameras_is_told_from_all_else() -> None:
         assert ColorsEvidence().find(before_plain(other)).choice == "many"
     assert ColorsEvidence().find(before_plain(smoke, frames.poses)).choice == "many"  # twelve viewpoints
     assert ColorsEvidence().find(frames).choice == "many"  # with alpha
+    noise = torch.randint(256, (12, 16, 16, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    everywhere = ColorsEvidence().find(replace(before_plain(smoke), images=noise))
+    assert (everywhere.choice, everywhere.is_certain) == ("many", True)  # no trial may say otherwise
     assert mixture_share(before_plain(smoke), behind) == 1
     assert mixture_share(before_plain(two), behind) < 0.8
 
