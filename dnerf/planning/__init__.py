@@ -6,13 +6,6 @@ from dnerf.planning.plan import Decision, Plan
 from dnerf.planning.planner import make_plan
 
 __all__ = [
-    "ColorsEvidence",
-    "Decision",
-    "Evidence",
-    "Finding",
-    "MotionEvidence",
-    "Part",
-    "Plan",
-    "SurroundingsEvidence",
+    "ColorsEvidence", "Decision", "Evidence", "Finding", "MotionEvidence", "Part", "Plan", "SurroundingsEvidence",
     "make_plan",
-]
+]  # fmt: skip
