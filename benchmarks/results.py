@@ -17,12 +17,17 @@ Compare times within one report only: machines, and hours of one machine, differ
 A dash is what a report does not say; a dagger after a commit points to a note beside the command.
 """
 
+FILMS = "images/films"  # beside the reports' folder: a film has its report's name
+FILMS_NOTE = """Each is of a run of the report of that name: `python scripts/render.py run=... path=orbit format=gif`.
+"""
+
 
 def results_page(folder: Path) -> str:
     """The page's text, in Markdown.
 
     Args:
-        folder: of the reports, one folder with a `results.json` for each; links to them are relative to its parent.
+        folder: of the reports, one folder with a `results.json` for each; links to them are relative to its parent,
+            where films of some may lie.
 
     Raises:
         ValueError: for a folder without reports, or naming a file that is none.
@@ -31,6 +36,9 @@ def results_page(folder: Path) -> str:
     if not reports:
         raise ValueError(f"reports must be a folder with */results.json, found none in {folder}")
     parts = [HEAD.format(folder=f"[{folder.name}/]({folder.name}/)")]
+    films = [name for name in reports if (folder.parent / FILMS / f"{name}.gif").is_file()]
+    if films:
+        parts += ["## Films\n", FILMS_NOTE, *(f"![{name}]({FILMS}/{name}.gif)" for name in films), ""]
     left = dict(reports)
     for title, table, note, rows_of in SECTIONS:
         own = {name: report for name, report in reports.items() if table in report["tables"]}

@@ -56,6 +56,18 @@ def test_page_has_a_row_of_each_result_and_the_command_of_each_report(reports):
         assert f"# {name}: 2026-11-28, commit abc\nmake {name}\n" in page
 
 
+def test_a_film_with_a_report_s_name_is_shown_and_no_other(reports):
+    assert "## Films" not in results_page(reports)
+    films = reports.parent / "images" / "films"
+    films.mkdir(parents=True)
+    for name in ("frames", "holiday"):
+        (films / f"{name}.gif").touch()
+    page = results_page(reports)
+    assert "## Films" in page
+    assert "![frames](images/films/frames.gif)" in page
+    assert "holiday" not in page
+
+
 def test_a_note_and_what_older_reports_lack_are_marked(reports):
     path = reports / "quality" / "results.json"
     values = json.loads(path.read_text())
