@@ -31,7 +31,8 @@ def run(settings: Settings) -> SuiteResult:
             for seed, folder in zip(options["seeds"], folders, strict=True)
         ]
         rows.append(_row(name, kind, runs))
-        parts.append({"representation": name, **_parts_of_a_step(settings, options, kind["overrides"])})
+        if name in options["profiled"]:
+            parts.append({"representation": name, **_parts_of_a_step(settings, options, kind["overrides"])})
         images.append(_shown(settings, options, str(folders[0])))
     write_png(contact_sheet(list(zip(*images, strict=True)), list(kinds), LAYERS), settings.work_dir / SHEET)
     return SuiteResult(

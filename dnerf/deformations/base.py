@@ -58,7 +58,7 @@ def deformation_at_time(deformation: Deformation, time: float, extent: Tensor | 
 
 
 class WrappedDeformation(Deformation):
-    """A deformation around another one, whose map it approximates: a cache, a spacing along rays."""
+    """A deformation around another one, whose map it approximates: a cache."""
 
     def __init__(self, deformation: Deformation) -> None:
         super().__init__()

@@ -85,7 +85,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         color_terms = temporal_terms + (self.view_degree + 1) ** 2 - 1
         self.head = MLP(in_features, hidden_features, num_layers, out_features=temporal_terms + 3 * color_terms)
         with torch.no_grad():  # a fresh series begins without the terms that change
-            for part in self._last:
+            for part in self.head.output.parameters():  # type: ignore[union-attr]
                 density, colors = self._series(part)
                 density[1:], colors[:, 1:] = 0, 0
 

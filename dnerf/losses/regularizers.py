@@ -234,7 +234,7 @@ class EikonalLoss(PlacesLoss):
     """
 
     def __init__(
-        self, box: Sequence[Sequence[float]], weight: float | Schedule = 1e-2, num_points: int = 256, *, every: int = 1
+        self, box: Sequence[Sequence[float]], weight: float | Schedule = 3e-3, num_points: int = 256, *, every: int = 1
     ) -> None:
         super().__init__(weight, num_points, dimensions=3, every=every)
         check_whole("num_points", num_points)

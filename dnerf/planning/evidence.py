@@ -18,8 +18,8 @@ NUM_DISTANCES = 64  # along each ray
 REACH = 1  # blocks of pixels by which outlines may be off
 NOT_CLEAR = 2  # alpha, of 255, from which a pixel shows something, be it fog
 AGREEMENT = 0.98  # share of the views in which one position is not empty, so that a body at rest explains a ray
-MAX_CAMERAS = 8  # that do not move: more tell what is thin from what is dark
-MIXTURES = 0.995  # share of the pixels
+MAX_CAMERAS = 8  # that do not move, as rigs for tomography have: more tell what is thin from what is dark
+MIXTURES = 0.995  # share of the pixels: some of a compressed film have other colours
 CLEAR_SHARE = 0.01  # of rays without such a position: fewer may be faults of single images
 
 
@@ -90,8 +90,8 @@ class ColorsEvidence(Evidence):
         if behind is None:
             return Finding("many", "the images have alpha, or show something everywhere")
         cameras = len(frames.poses.unique(dim=0))
-        if cameras > MAX_CAMERAS:
-            return Finding("many", f"{cameras} viewpoints tell what is thin from what is dark")
+        if not cameras < len(frames) or cameras > MAX_CAMERAS:
+            return Finding("many", f"{cameras} viewpoints of {len(frames)} frames are not a few that stand still")
         if mixture_share(frames, behind) < MIXTURES:
             return Finding("many", "the images have colours that no single one makes")
         return Finding("one", f"all pixels are mixtures of the background and one colour, for {cameras} cameras")
@@ -100,7 +100,7 @@ class ColorsEvidence(Evidence):
 def mixture_share(frames: Frames, behind: torch.Tensor) -> float:
     """The share of pixels that are mixtures of a colour (3,) in [0, 1] behind and one other, up to `SAME_LEVELS`."""
     images = (frames.stored_image(i)[::EVERY_PIXEL, ::EVERY_PIXEL, :3] for i in evenly_spread(len(frames), MAX_VIEWS))
-    away = torch.cat([image.flatten(0, 1) for image in images]).float() - 255 * behind
+    away = torch.cat([image.flatten(0, 1) for image in images]).float() - 255 * behind.to(frames.poses.device)
     color = torch.linalg.eigh(away.T @ away)[1][:, -1]
     color = color * torch.sign((away @ color).sum())
     return float(((away - (away @ color).clamp(min=0)[:, None] * color).norm(dim=-1) <= SAME_LEVELS).float().mean())

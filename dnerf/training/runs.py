@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -217,22 +218,22 @@ def _complaint(make: Any, given: Mapping[str, Any], place: str) -> str:
     for name in given:
         if name not in named and not takes_any:
             said = f"{_joined(place, name)} is none of {make.__name__}'s arguments: {', '.join(named)}"
-            others = _who_takes(name, make)
-            return f"{said}; {', '.join(others)} would take it" if others else said
+            return said + _who_takes(name, make)
     for name in named:
         if name not in given and parameters[name].default is inspect.Parameter.empty:
             return f"{_joined(place, name)} is missing: {make.__name__} needs it"
     return ""
 
 
-def _who_takes(argument: str, make: Any) -> list[str]:
-    """Other classes, of the package that a class lies in, with an argument of that name."""
-    there = vars(importlib.import_module(make.__module__.rpartition(".")[0] or make.__module__))
-    return [
-        name for name, other in there.items()
-        if isinstance(other, type) and not inspect.isabstract(other)
+def _who_takes(argument: str, make: Any) -> str:
+    """Names other classes, of the package that a class lies in, with an argument of that name, if there are some."""
+    package = sys.modules.get(make.__module__.rpartition(".")[0], sys.modules[make.__module__])
+    names = [
+        name for name, other in vars(package).items()
+        if inspect.isclass(other) and not inspect.isabstract(other) and inspect.isfunction(cast(Any, other).__init__)
         and argument in inspect.signature(cast(Any, other).__init__).parameters
     ]  # fmt: skip
+    return f"; {', '.join(names)} would take it" if names else ""
 
 
 def _plain_yaml(path: Path) -> Any:

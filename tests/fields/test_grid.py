@@ -63,10 +63,10 @@ def test_time_features_let_a_place_change_with_time() -> None:
         assert torch.equal(first, last) != changes
 
 
-@pytest.mark.parametrize("view_degree", [None, 1])
-def test_density_and_colour_follow_cosine_series_that_begin_constant(view_degree: int | None) -> None:
+@pytest.mark.parametrize(("view_degree", "one_color"), [(None, False), (1, False), (None, True)])
+def test_density_and_colour_follow_cosine_series_that_begin_constant(view_degree: int | None, one_color: bool) -> None:
     """Before their activations, values at six times determine three cosines, and those the values at all others."""
-    field = small(temporal_terms=3, view_degree=view_degree).double()
+    field = small(temporal_terms=3, view_degree=view_degree, one_color=one_color).double()
     positions = (torch.rand(20, 1, 3) + torch.tensor([0.0, 0.0, 3.0])).double().expand(20, 41, 3)
     times = torch.linspace(0, 1, 41, dtype=torch.float64).expand(20, 41)
     fresh = field(positions, positions, times)

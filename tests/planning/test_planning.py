@@ -207,6 +207,7 @@ def test_smoke_of_one_colour_before_few_cameras_is_told_from_all_else() -> None:
     for other in (two, both_sides):
         assert ColorsEvidence().find(before_plain(other)).choice == "many"
     assert ColorsEvidence().find(before_plain(smoke, frames.poses)).choice == "many"  # twelve viewpoints
+    assert ColorsEvidence().find(before_plain(smoke).subset([0, 1, 2, 3])).choice == "many"  # an image of each camera
     assert ColorsEvidence().find(frames).choice == "many"  # with alpha
     noise = torch.randint(256, (12, 16, 16, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     everywhere = ColorsEvidence().find(replace(before_plain(smoke), images=noise))
