@@ -30,7 +30,7 @@ def run(settings: Settings) -> SuiteResult:
         summary=(
             "Every run is a process of its own that trains for the given seconds (wall clock; loading data and "
             "compiling kernels left out, as the trainer counts), with learning rates that end with the budget, and is "
-            f"then scored at {options['resolution']} x {options['resolution']} pixels on held-out frames. "
+            f"then scored on held-out frames, {options['resolution']} pixels wide. "
             "Memory is the most the process ever held, data, training and scoring together; `model_MiB` is the size of "
             "the weights file."
             + "".join(
