@@ -18,7 +18,8 @@ A dash is what a report does not say; a dagger after a commit points to a note b
 """
 
 FILMS = "images/films"  # beside the reports' folder: a film has its report's name
-FILMS_NOTE = """Each is of a run of the report of that name: `python scripts/render.py run=... path=orbit format=gif`.
+FILMS_NOTE = """Each is of a run of the report of that name, by
+`python scripts/render.py run=... path=orbit num_frames=40 fps=10 resolution=180 format=gif`.
 """
 
 
