@@ -36,7 +36,7 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
     resampled; activations other than the ReLU, which gives no gradient where it is zero; empty space is left out by the
     sampler's occupied cells, not by a sparse table; harmonics beside the constant are kept in coarse levels only.
 
-    Adam's step touches every number, so most of a step's time goes there and not to the samples: large batches pay.
+    Gradients and Adam touch every number, so most of a step's time goes there, not to samples: large batches pay.
 
     Args:
         box: (2, 3) corners of the modelled space; positions outside see the nearest face.
