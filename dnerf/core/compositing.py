@@ -84,6 +84,14 @@ def render_weights(optical_depth: Tensor, samples: Samples) -> Tensor:
     return transmittance * -torch.expm1(-depth)
 
 
+def sums_before(values: Tensor, samples: Samples) -> Tensor:
+    """Sum of the values, (R, S) or (N,), before each sample on its ray, laid out like them."""
+    if not samples.is_packed:
+        return values.cumsum(-1) - values
+    sums = torch.nn.functional.pad(values.cumsum(0), (1, 0))
+    return sums[:-1] - samples.per_sample(sums[samples.offsets[:-1]])
+
+
 def sum_along_rays(values: Tensor, samples: Samples, weights: Tensor | None = None) -> Tensor:
     """Sum each ray's samples, weighted if weights are given.
 

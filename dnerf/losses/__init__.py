@@ -4,9 +4,10 @@ from dnerf.losses.base import Batch, Loss
 from dnerf.losses.deformation import AppearanceConstancyLoss, ElasticLoss, JacobianDeterminantLoss, RestLoss
 from dnerf.losses.histogram import HistogramLoss
 from dnerf.losses.photometric import PhotometricLoss
-from dnerf.losses.regularizers import EikonalLoss, SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
+from dnerf.losses.regularizers import DistortionLoss, EikonalLoss, SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 
 __all__ = [
-    "AppearanceConstancyLoss", "Batch", "EikonalLoss", "ElasticLoss", "HistogramLoss", "JacobianDeterminantLoss",
-    "Loss", "PhotometricLoss", "RestLoss", "SmoothnessLoss", "TimeEmbeddingLoss", "UnseenSpaceLoss",
+    "AppearanceConstancyLoss", "Batch", "DistortionLoss", "EikonalLoss", "ElasticLoss", "HistogramLoss",
+    "JacobianDeterminantLoss", "Loss", "PhotometricLoss", "RestLoss", "SmoothnessLoss", "TimeEmbeddingLoss",
+    "UnseenSpaceLoss",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Terms about the field rather than the image: unseen space, surfaces, roughness of volumes and time embeddings."""
+"""Terms about the field rather than the image: unseen space, haze, surfaces, roughness of volumes and embeddings."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive, check_whole
-from dnerf.core.compositing import Rendering
+from dnerf.core.compositing import Rendering, sum_along_rays, sums_before
 from dnerf.core.schedules import Schedule
 from dnerf.deformations import unwrapped
 from dnerf.fields.base import HasRoughness, RadianceField, SignedDistance, surface_of
@@ -27,6 +27,7 @@ class PlacesLoss(Loss):
 
     def __init__(self, weight: float | Schedule, num_points: int, *, dimensions: int, every: int) -> None:
         super().__init__(weight, every=every)
+        check_whole("num_points", num_points)
         self.num_points = num_points
         self.num_calls = nn.Buffer(torch.zeros((), dtype=torch.int64))
         powers = torch.arange(1, dimensions + 1, dtype=torch.float64)
@@ -70,10 +71,7 @@ class UnseenSpaceLoss(PlacesLoss):
         every: int = 4, length: float = 0.02, resolution: int = 64, memory_samples: int = 1 << 20,
     ) -> None:  # fmt: skip
         super().__init__(weight, num_points, dimensions=5, every=every)
-        for name, value in (
-            ("num_points", num_points), ("length", length), ("resolution", resolution),
-            ("memory_samples", memory_samples),
-        ):  # fmt: skip
+        for name, value in (("length", length), ("resolution", resolution), ("memory_samples", memory_samples)):
             check_positive(name, value)
         self.length = length
         self.memory_samples = memory_samples
@@ -117,6 +115,26 @@ class UnseenSpaceLoss(PlacesLoss):
         unit = (positions - self.box[0]) / (self.box[1] - self.box[0])
         x, y, z = (unit * size).long().clamp(0, size - 1).unbind(-1)
         return (x * size + y) * size + z
+
+
+class DistortionLoss(Loss):
+    """What a ray shows lies together, so that there is no haze in front of things.
+
+    `sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 l_i / 3`, the mean over rays, for weights w of samples at distances m, and
+    lengths l of their intervals.
+
+    Source: mip-NeRF 360 (arXiv 2111.12077) eq. 15, with distances in world units.
+    """
+
+    def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
+        """The mean over rays; pairs are summed in time proportional to the samples."""
+        assert rendering.samples is not None
+        assert rendering.weights is not None
+        samples, weights = rendering.samples, rendering.weights.double()
+        moments = weights * samples.distances
+        pairs = 2 * (moments * sums_before(weights, samples) - weights * sums_before(moments, samples))
+        spread = sum_along_rays(pairs + weights.square() * samples.lengths / 3, samples)
+        return rendering.mean(spread).to(rendering.rgb.dtype)
 
 
 class SmoothnessLoss(Loss):
@@ -180,8 +198,7 @@ class TimeEmbeddingLoss(Loss):
         self, weight: float | Schedule = 1e-3, *, rays_per_embedding: int | None = 5_000, every: int = 4
     ) -> None:
         super().__init__(weight, every=every)
-        if rays_per_embedding is not None:
-            check_positive("rays_per_embedding", rays_per_embedding)
+        check_positive("rays_per_embedding", 1 if rays_per_embedding is None else rays_per_embedding)
         self.rays_per_embedding = rays_per_embedding
         self.num_rays = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
@@ -237,7 +254,6 @@ class EikonalLoss(PlacesLoss):
         self, box: Sequence[Sequence[float]], weight: float | Schedule = 3e-3, num_points: int = 256, *, every: int = 1
     ) -> None:
         super().__init__(weight, num_points, dimensions=3, every=every)
-        check_whole("num_points", num_points)
         self.box = nn.Buffer(as_box(box), persistent=False)
 
     def check(self, model: Renderer) -> None:

@@ -13,9 +13,9 @@ from dnerf.scenes.textures import Checker, Glossy, Glow, Gradient, Lit, Plain, S
 from dnerf.scenes.warps import Bend, Twist, Warp
 
 NAMES = (
-    "bending_rod", "bouncing_balls", "courtyard", "dense_fog", "fast_ball", "glossy_ball", "jumping_ball",
-    "merging_balls", "opaque_wall", "orbiting_balls", "pulsing_fog", "snowman", "static", "thin_rod", "twisting_block",
-    "vanishing_ball", "walker",
+    "bending_rod", "bouncing_balls", "courtyard", "dense_fog", "glossy_ball", "jumping_ball", "merging_balls",
+    "opaque_wall", "orbiting_balls", "pulsing_fog", "snowman", "static", "thin_rod", "twisting_block", "vanishing_ball",
+    "walker",
 )  # fmt: skip
 SCENES: dict[str, Callable[..., AnalyticScene]] = {
     name: getattr(import_module(f"dnerf.scenes.library.{name}"), f"make_{name}") for name in NAMES

@@ -1,7 +1,7 @@
 """Films of a model: camera and time paths, frames that survive a kill, images of depth and motion, and their files."""
 
 from dnerf.core.geometry import box_planes
-from dnerf.visualization.camera_paths import fixed_path, orbit_path, pose_around, spiral_path
+from dnerf.visualization.camera_paths import fixed_path, pose_around, spiral_path
 from dnerf.visualization.colours import colorize, error_map, flow_colors, flow_image, scaled_image
 from dnerf.visualization.data_sheet import data_sheet
 from dnerf.visualization.films import FILM_FORMATS, empty_frames, render_frames_to, write_films, write_plan
@@ -19,7 +19,7 @@ __all__ = [
     "FILM_FORMATS", "OUTPUTS", "FrameStore", "KeyFrames", "Surroundings", "View", "box_planes", "check_outputs",
     "colorize", "comparison_sheet", "contact_sheet", "data_sheet", "deformation_magnitude", "draw_tracks",
     "empty_frames", "error_map", "film_times", "fixed_path", "flow_colors", "flow_image", "interpolate", "make_views",
-    "orbit_path", "parse_key_frames", "pingpong_times", "pose_around", "read_key_frames", "render_frames_to",
-    "render_layers", "render_tracks", "scaled_image", "sequence_digest", "spiral_path",
-    "sweep_times", "visible_points", "write_films", "write_frames", "write_npz", "write_plan", "write_png",
+    "parse_key_frames", "pingpong_times", "pose_around", "read_key_frames", "render_frames_to",
+    "render_layers", "render_tracks", "scaled_image", "sequence_digest", "spiral_path", "sweep_times", "visible_points",
+    "write_films", "write_frames", "write_npz", "write_plan", "write_png",
 ]  # fmt: skip

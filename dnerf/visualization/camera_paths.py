@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,24 +21,10 @@ def pose_around(target: Sequence[float], *, radius: float, azimuth: float, eleva
     return look_at([t + radius * o for t, o in zip(target, offset, strict=True)], target)
 
 
-def orbit_path(num_poses: int, *, elevation: float = math.radians(30), turns: float = 1.0, **placed: Any) -> Tensor:
-    """Poses (num_poses, 4, 4) on a circle of latitude, z up, angles in radians; `placed` as in `spiral_path`.
-
-    A whole number of turns closes: the pose after the last is the first.
-    """
-    return spiral_path(num_poses, elevations=(elevation, elevation), turns=turns, **placed)
-
-
 def spiral_path(
-    num_poses: int,
-    *,
-    radius: float = 4.0,
-    elevations: tuple[float, float] = (math.radians(5), math.radians(60)),
-    target: Sequence[float] = (0.0, 0.0, 0.0),
-    turns: float = 2.0,
-    start_angle: float = 0.0,
-    sway: float | None = None,
-) -> Tensor:
+    num_poses: int, *, radius: float = 4.0, elevations: tuple[float, float] = (math.radians(5), math.radians(60)),
+    target: Sequence[float] = (0.0, 0.0, 0.0), turns: float = 2.0, start_angle: float = 0.0, sway: float | None = None,
+) -> Tensor:  # fmt: skip
     """Poses (num_poses, 4, 4) circling `target` while rising from one elevation to the other and back.
 
     With `sway`, an angle, the path does not go round but so far to either side of `start_angle`, `turns` times.

@@ -12,7 +12,15 @@ from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.rays import Samples
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes, VoxelField
-from dnerf.losses import Batch, Loss, PhotometricLoss, SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
+from dnerf.losses import (
+    Batch,
+    DistortionLoss,
+    Loss,
+    PhotometricLoss,
+    SmoothnessLoss,
+    TimeEmbeddingLoss,
+    UnseenSpaceLoss,
+)
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 
@@ -278,3 +286,44 @@ def test_a_model_without_embeddings_is_named_before_training() -> None:
         TimeEmbeddingLoss(-1.0)
     with pytest.raises(ValueError, match="rays_per_embedding must be"):
         TimeEmbeddingLoss(rays_per_embedding=0)
+
+
+def spread_of(weights: Tensor, samples: Samples) -> Tensor:
+    rgb = weights.new_zeros(samples.num_rays, 3)
+    rendering = Rendering(rgb, rgb[:, 0], rgb[:, 0], weights=weights, samples=samples)
+    return DistortionLoss()(rendering, of(rgb), RENDERER)
+
+
+def some_samples(is_packed: bool) -> tuple[Tensor, Samples]:
+    """Weights of five samples on each of three rays; packed ones are none, two and all of a ray's."""
+    generator = torch.Generator().manual_seed(0)
+    ends = torch.rand(3, 5, dtype=torch.float64, generator=generator).cumsum(-1)
+    lengths = 0.9 * ends.diff(dim=-1, prepend=ends.new_zeros(3, 1))
+    weights = 0.3 * torch.rand(3, 5, dtype=torch.float64, generator=generator)
+    if not is_packed:
+        return weights, Samples(ends - lengths, ends, 3)
+    kept = torch.tensor([[False] * 5, [True, True, False, False, False], [True] * 5])
+    rays = kept.nonzero()[:, 0]
+    return weights[kept], Samples((ends - lengths)[kept], ends[kept], 3, ray_indices=rays)
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+def test_distortion_is_the_sum_over_all_pairs_of_samples(is_packed: bool) -> None:
+    weights, samples = some_samples(is_packed)
+    rays = torch.arange(3).repeat_interleave(5) if samples.ray_indices is None else samples.ray_indices
+    flat, places, lengths = (x.reshape(-1).tolist() for x in (weights, samples.distances, samples.lengths))
+    expected = 0.0
+    for ray in range(3):
+        mine = [i for i, number in enumerate(rays.tolist()) if number == ray]
+        expected += sum(flat[i] * flat[j] * abs(places[i] - places[j]) for i in mine for j in mine)
+        expected += sum(flat[i] ** 2 * lengths[i] / 3 for i in mine)
+    assert spread_of(weights, samples).item() == pytest.approx(expected / 3, rel=1e-12)
+    assert torch.autograd.gradcheck(lambda w: spread_of(w, samples), weights.requires_grad_())
+
+
+def test_distortion_of_one_thin_opaque_place_and_of_nothing_is_zero() -> None:
+    weights = torch.tensor([[0.0, 1.0, 0.0]])
+    starts = torch.tensor([[1.0, 2.0, 3.0]])
+    assert spread_of(weights, Samples(starts, starts + 1e-6, 1)).item() < 1e-6
+    nothing = torch.zeros(0)
+    assert spread_of(nothing, Samples(nothing, nothing, 2, ray_indices=nothing.long())).item() == 0.0

@@ -14,7 +14,7 @@ from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import AnalyticScene, Ball, Body, Box, Fixed, Plain, make_scene
 
 HARD = [
-    "thin_rod", "fast_ball", "opaque_wall", "merging_balls", "vanishing_ball", "jumping_ball", "twisting_block",
+    "thin_rod", "opaque_wall", "merging_balls", "vanishing_ball", "jumping_ball", "twisting_block",
     "bending_rod", "dense_fog", "bouncing_balls", "snowman",
 ]  # fmt: skip
 
@@ -114,11 +114,3 @@ def test_merging_bodies_add_up_where_they_overlap() -> None:
     assert isinstance(scene.bodies[0].shape, Ball)
     _, opacity, _ = render_exact(scene, ray)
     assert opacity.item() == pytest.approx(-math.expm1(-2 * density * 2 * radius), rel=1e-12)
-
-
-def test_a_fast_ball_leaves_its_own_place_within_one_frame_of_a_hundred() -> None:
-    scene = make_scene("fast_ball")
-    ball = scene.bodies[0]
-    t0 = torch.linspace(0, 0.99, 100, dtype=torch.float64)
-    moved = (ball.motion.pose(t0 + 0.01).translation - ball.motion.pose(t0).translation).norm(dim=-1)
-    assert (moved > 2 * ball.shape.radius).all()

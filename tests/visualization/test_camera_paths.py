@@ -8,11 +8,11 @@ import torch
 
 from dnerf.core.cameras import look_at
 from dnerf.core.geometry import so3_exp
-from dnerf.visualization import box_planes, fixed_path, orbit_path, pose_around, spiral_path
+from dnerf.visualization import box_planes, fixed_path, pose_around, spiral_path
 
 
 def test_orbit_closes() -> None:
-    poses = orbit_path(12, radius=3.0, elevation=0.4, target=(1, 2, 3), start_angle=0.3).double()
+    poses = spiral_path(12, radius=3.0, elevations=(0.4, 0.4), target=(1, 2, 3), turns=1, start_angle=0.3).double()
     turn = so3_exp(torch.tensor([0, 0, 2 * math.pi / 12], dtype=torch.float64))
     target = torch.tensor([1, 2, 3], dtype=torch.float64)
     for this, following in zip(poses, poses.roll(-1, 0)):
@@ -55,8 +55,8 @@ def test_planes_of_an_axis_aligned_view_are_the_boxes_faces() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: orbit_path(0), "num_poses must be > 0"),
-        (lambda: orbit_path(4, radius=0.0), "radius must be > 0"),
+        (lambda: spiral_path(0), "num_poses must be > 0"),
+        (lambda: spiral_path(4, radius=0.0), "radius must be > 0"),
         (lambda: fixed_path(0, torch.eye(4)), "num_poses must be > 0"),
         (lambda: fixed_path(3, torch.eye(3)), "pose must have shape"),
         (lambda: box_planes(torch.eye(4), [[0.0] * 3, [1.0] * 3]), "poses must have shape"),

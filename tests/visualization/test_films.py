@@ -32,7 +32,7 @@ def make_renderer(num_samples: int = 48) -> Renderer:
 
 
 def some_views(count: int) -> list[films.View]:
-    poses = films.orbit_path(count, turns=0.1)
+    poses = films.spiral_path(count, turns=0.1)
     return films.make_views(poses, films.sweep_times(count, 0.2, 0.4), INTRINSICS, [(2.0, 6.0)] * count)
 
 
@@ -114,7 +114,7 @@ def test_what_is_static_does_not_move_and_what_is_unknown_is_no_number() -> None
 
 @pytest.mark.parametrize("radius", [8.0, 4.0, 1.6, 1.0, 0.3])
 def test_planes_hold_the_whole_box_wherever_the_camera_is(tmp_path: Path, radius: float) -> None:
-    poses = films.orbit_path(3, radius=radius)
+    poses = films.spiral_path(3, radius=radius)
     planes = films.box_planes(poses, BOX)
     for pose, (near, far) in zip(poses, planes):
         camera = Camera(INTRINSICS, pose, near, far)
@@ -129,7 +129,7 @@ def test_planes_hold_the_whole_box_wherever_the_camera_is(tmp_path: Path, radius
 
 
 def test_an_empty_film_is_noticed(tmp_path: Path) -> None:
-    away = films.orbit_path(2, target=(0.0, 0.0, 50.0), radius=1.0)
+    away = films.spiral_path(2, target=(0.0, 0.0, 50.0), radius=1.0)
     store = films.FrameStore(tmp_path, 2)
     views = films.make_views(away, [0.0, 1.0], INTRINSICS, films.box_planes(away, BOX))
     films.render_frames_to(store, make_renderer(), views, ["rgb"])
