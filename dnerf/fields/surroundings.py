@@ -40,7 +40,7 @@ class SurroundingsBackground(Background):
 
     shows_beyond = True
 
-    def __init__(self, box: Sequence[Sequence[float]], field: RadianceField, num_intervals: int = 24) -> None:
+    def __init__(self, box: Sequence[Sequence[float]], field: RadianceField, num_intervals: int = 16) -> None:
         super().__init__()
         check_whole("num_intervals", num_intervals)
         if num_intervals < 2:
