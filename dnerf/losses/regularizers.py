@@ -1,4 +1,4 @@
-"""Terms about the field rather than the image: unseen space, haze, surfaces, roughness of volumes and embeddings."""
+"""Terms about the field, not the image: unseen space, floaters, surfaces, roughness of volumes and embeddings."""
 
 from collections.abc import Sequence
 
@@ -118,7 +118,7 @@ class UnseenSpaceLoss(PlacesLoss):
 
 
 class DistortionLoss(Loss):
-    """What a ray shows lies together, so that there is no haze in front of things.
+    """Spread of the weights along each ray: one surface costs least, floaters in front of it cost more.
 
     `sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 l_i / 3`, the mean over rays, for weights w of samples at distances m, and
     lengths l of their intervals.
