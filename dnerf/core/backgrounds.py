@@ -1,4 +1,4 @@
-"""What lies behind the scene: one colour, or another one for every training ray."""
+"""What lies behind the scene: one colour, or in training any."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -28,6 +28,7 @@ class Background(nn.Module, ABC):
     """Colour behind each ray."""
 
     needs_alpha = False  # whether training needs images with alpha
+    variance = 0.0  # of its colours in training, of which it gives the mean
     shows_beyond = False  # whether it is a scene beyond the box: costly, and left out where no light gets through
 
     @abstractmethod
@@ -60,23 +61,23 @@ class ConstantBackground(Background):
 
 
 class RandomBackground(ConstantBackground):
-    """Another uniform random colour for every ray while training, one colour in evaluation.
+    """Any colour in training, one colour in evaluation.
 
     A training image with alpha is composited on the same colours, so only true opacity explains it: the
-    cure for fields that paint the background's colour into empty space.
+    cure for fields that paint the background's colour into empty space. Nothing is drawn: with colours b uniform in
+    [0, 1], errors e of premultiplied colour and a of opacity, the mean of `(e - a b)^2` is `(e - a / 2)^2 + a^2 / 12`,
+    the error on grey and the variance times that of opacity. The losses take this mean.
 
     Args:
         color: colour in evaluation mode.
     """
 
     needs_alpha = True
+    variance = 1 / 12
 
     def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Tensor:
-        """Random colours (R, 3) in training mode, the constant one in evaluation mode."""
-        if not self.training:
-            return super().forward(rays)
-        like = rays.origins
-        return torch.rand(len(rays), 3, generator=generator, dtype=like.dtype, device=like.device)
+        """The mean colour (R, 3), grey, in training mode, the constant one in evaluation mode."""
+        return torch.full_like(rays.origins, 0.5) if self.training else super().forward(rays)
 
     def constant(self) -> Tensor | None:
         """The colour (3,) of evaluation mode."""

@@ -56,8 +56,8 @@ class Rays:
 class Samples:
     """Intervals along R rays, dense (R, S) or packed (N,), and the point of each where the field is evaluated.
 
-    Intervals of a ray are ordered and do not overlap; an interval of length zero adds nothing. Packed samples of ray r
-    are `ray_offsets[r]:ray_offsets[r + 1]`. ValueError if shapes do not fit each other.
+    Intervals of a ray are ordered and do not overlap, unless `stretched`; empty ones add nothing. Packed samples of
+    ray r are `ray_offsets[r]:ray_offsets[r + 1]`. ValueError if shapes do not fit each other.
     """
 
     starts: Tensor  # (R, S) or (N,) distance where an interval begins, in world units
@@ -196,6 +196,13 @@ class Samples:
             ray_offsets=before[self.offsets],
             bounds=tuple(bound[whole] for bound in self.bounds),
         )
+
+    def stretched(self, factors: Tensor) -> "Samples":
+        """Intervals so many times as long, (N,) >= 1, around the same middles; they may overlap. For samples that stand
+        for others beside them; points must be in the middle."""
+        check_shape("factors", factors, self.starts.shape)
+        more = 0.5 * (factors - 1) * self.lengths  # nothing at a factor of one, whatever rounding does
+        return replace(self, starts=self.starts - more, ends=self.ends + more)
 
     def fitted(self, counts: Tensor, size: int) -> "tuple[Samples, Tensor]":
         """Packed samples, each interval cut into so many equal ones or (0) left out, in a fixed number of places.

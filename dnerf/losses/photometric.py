@@ -12,6 +12,8 @@ from dnerf.rendering.renderer import Renderer
 class PhotometricLoss(Loss):
     """Mean squared or Huber error of colour, of the earlier (coarse) passes as well: NeRF eq. 6.
 
+    Where any colour may lie behind (`RandomBackground`), its variance times the squared error of opacity is added.
+
     Args:
         kind: "mse", or "huber" (quadratic below `delta`, linear above, scaled to agree with the mse for small errors).
         delta: where Huber turns linear, in units of colour.
@@ -35,14 +37,15 @@ class PhotometricLoss(Loss):
 
     def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
         """Error of the image plus the weighted errors of its proposals' images."""
-        loss = self._error(rendering, batch.target)
+        loss = self._error(rendering, batch, model)
         for proposal in rendering.proposals:
-            loss = loss + self.proposal_weight * self._error(proposal, batch.target)
+            loss = loss + self.proposal_weight * self._error(proposal, batch, model)
         return loss
 
-    def _error(self, rendering: Rendering, target: Tensor) -> Tensor:
+    def _error(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
         if self.kind == "mse":
-            errors = nn.functional.mse_loss(rendering.rgb, target, reduction="none")
+            errors = nn.functional.mse_loss(rendering.rgb, batch.target, reduction="none")
         else:
-            errors = 2 * nn.functional.huber_loss(rendering.rgb, target, delta=self.delta, reduction="none")
-        return rendering.mean(errors.mean(-1))
+            errors = 2 * nn.functional.huber_loss(rendering.rgb, batch.target, delta=self.delta, reduction="none")
+        missing = (rendering.opacity - batch.rgba[:, 3]).square()
+        return rendering.mean(errors.mean(-1) + model.background.variance * missing)

@@ -17,7 +17,7 @@ from dnerf.fields.base import RadianceField, density_of_samples, evaluate_along_
 from dnerf.kernels import MarchGrid, footprints, march, march_to_size, seen_parts
 from dnerf.samplers.base import Capacity, FixedCapacity, FrontToBack, OccupancyAware, OccupiedCells, Sampler
 from dnerf.samplers.occupancy_grid import OccupancyGrid
-from dnerf.samplers.visibility import joined, visible_weights
+from dnerf.samplers.visibility import by_chance, joined, visible_weights
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
@@ -46,6 +46,9 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         min_weight: in training, the field is first evaluated for densities without gradients, front to back, and only
             samples whose weight in the image exceeds this get the pass with gradients; 0 for all. (Images leave out
             less than `Renderer.stop_transmittance` instead, and evaluate twice only to find what is to be cut.)
+        chance_weight: weight in the image, in [0, 1), below which that filter takes samples by chance, in proportion to
+            it, and makes them count for as much more: of much that is thin a few samples learn, and more rays are seen
+            for the same number. 0 takes all; so do fields whose density needs an interval's ends (`IntervalAware`).
         filter_joins: until intervals are cut, the filter of `min_weight` evaluates once for so many neighbouring ones,
             and keeps all or none.
         pad_to: in training, and where intervals are cut, the number of samples is rounded up to a multiple of this,
@@ -58,7 +61,8 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
     def __init__(
         self, grid: OccupancyGrid, step_size: float | Schedule = 0.02, *, subdivision: int = 1,
         render_subdivision: int | None = None, subdivision_weight: float = 0.0, subdivide_from: float = 0.5,
-        narrow_from: float = 1.0, min_weight: float = 0.0, filter_joins: int = 1, pad_to: int = 2048,
+        narrow_from: float = 1.0, min_weight: float = 0.0, chance_weight: float = 0.0, filter_joins: int = 1,
+        pad_to: int = 2048,
     ) -> None:  # fmt: skip
         super().__init__()
         render_subdivision = subdivision if render_subdivision is None else render_subdivision
@@ -67,7 +71,9 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
             ("pad_to", pad_to),
         ):  # fmt: skip
             check_whole(name, count)
-        for name, value in (("subdivision_weight", subdivision_weight), ("min_weight", min_weight)):
+        for name, value in (
+            ("subdivision_weight", subdivision_weight), ("min_weight", min_weight), ("chance_weight", chance_weight),
+        ):  # fmt: skip
             check_within(name, value, "[0, 1)")
         for name, value in (("subdivide_from", subdivide_from), ("narrow_from", narrow_from)):
             check_within(name, value, "[0, 1]")
@@ -77,7 +83,7 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         self.step_schedule = step_size
         self.step_size = at(step_size, 1.0)
         self.subdivision, self.render_subdivision = subdivision, render_subdivision
-        self.subdivision_weight, self.min_weight = subdivision_weight, min_weight
+        self.subdivision_weight, self.min_weight, self.chance_weight = subdivision_weight, min_weight, chance_weight
         self.subdivide_from, self.narrow_from = subdivide_from, narrow_from
         self.filter_joins, self.pad_to = filter_joins, pad_to
         # Of a step in training: a tensor, since graphs that replay steps read it.
@@ -97,7 +103,7 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         if not self.training:
             return samples.split(self.render_subdivision)
         if self.min_weight > 0:
-            samples = self._visible(samples, rays, field)
+            samples = self._visible(samples, rays, field, generator)
         else:
             samples = samples.split(self.training_subdivision)
         return samples.padded(self.pad_to)
@@ -191,7 +197,10 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         weights = render_weights(interval_depths(density, samples.lengths), samples)
         subdivision = self.training_subdivision if self.training else self.render_subdivision
         is_seen = ~(weights <= min_weight) if min_weight else torch.ones_like(weights, dtype=torch.bool)
-        counts = self._counts(weights, subdivision) * (is_seen & is_filled)  # NaN is
+        is_seen &= is_filled  # NaN is seen
+        if self.training:
+            is_seen, samples = self._by_chance(samples, weights, is_seen, field, generator)
+        counts = self._counts(weights, subdivision) * is_seen
         samples, num_wanted = samples.fitted(counts, capacity.kept)
         return replace(samples, wanted=torch.stack([num_marched, num_wanted]))
 
@@ -244,7 +253,9 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
             far=torch.minimum(rays.far, behind.add_(ROOM).ceil_().mul_(grid.step).add_(rays.near)),
         )
 
-    def _visible(self, samples: Samples, rays: Rays, field: RadianceField) -> Samples:
+    def _visible(
+        self, samples: Samples, rays: Rays, field: RadianceField, generator: torch.Generator | None
+    ) -> Samples:
         joint, number = joined(samples, self.filter_joins if self.training_subdivision == 1 else 1)
         weights = visible_weights(
             joint, rays, field, self.min_weight,
@@ -252,5 +263,17 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         )  # fmt: skip
         weights = weights[number]
         is_visible = ~(weights <= self.min_weight)  # NaN is
+        is_visible, samples = self._by_chance(samples, weights, is_visible, field, generator)
         kept, count = samples.kept(is_visible), self.training_subdivision
         return kept if count == 1 else kept.split(self._counts(weights[is_visible], count))
+
+    def _by_chance(
+        self, samples: Samples, weights: Tensor, is_visible: Tensor, field: RadianceField,
+        generator: torch.Generator | None,
+    ) -> tuple[Tensor, Samples]:  # fmt: skip
+        """Which of the visible samples (N,) are taken, and all of them, as long as one that is taken counts."""
+        if not self.chance_weight or interval_aware(field) is not None:
+            return is_visible, samples
+        chances = torch.where(weights < self.chance_weight, weights / self.chance_weight, 1)
+        is_taken = by_chance(torch.where(is_visible, chances, 0), generator)
+        return is_taken, samples.stretched(torch.where(is_taken, 1 / chances, 1))

@@ -145,3 +145,14 @@ def joined(samples: Samples, most: int) -> tuple[Samples, Tensor]:
         ray_offsets=before[samples.offsets],
     )  # fmt: skip
     return merged, before[1:] - 1
+
+
+@torch.no_grad()
+def by_chance(chances: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Take samples (N,) with such chances in [0, 1], evenly: of neighbours, as many as their chances add up to.
+
+    Source: systematic sampling (Kitagawa, JCGS 1996), one random number for all.
+    """
+    unit = torch.rand((), generator=generator, dtype=torch.float64, device=chances.device)
+    sums = torch.nn.functional.pad((chances.cumsum(0, dtype=torch.float64) + unit).floor(), (1, 0))
+    return sums.diff() > 0

@@ -109,11 +109,14 @@ class Stepper:
         if total.requires_grad:
             total.backward()
             run.optimizer.step()
+        opacity, variance = rendering.opacity.detach(), run.renderer.background.variance
         errors = (rendering.rgb.detach() - batch.target).square().mean(-1)
+        errors = errors + variance * (opacity - rgba[:, 3]).square()
         known = errors if rendering.is_placed is None else torch.where(rendering.is_placed, errors, -1)
         assert rendering.background is not None
-        contrast = (batch.target - rendering.background).detach().abs().amax(-1)
-        means = {"mse": errors, "opacity": rendering.opacity.detach(), "contrast": contrast}
+        contrast = (batch.target - rendering.background).detach().square().amax(-1)
+        contrast = (contrast + variance * rgba[:, 3].square()).sqrt()  # grey on grey is seen before other colours
+        means = {"mse": errors, "opacity": opacity, "contrast": contrast}
         found = {"loss": total, **terms, **{name: rendering.mean(values) for name, values in means.items()}}
         return {name: values.detach() for name, values in {**found, ERRORS: known}.items()}
 

@@ -8,6 +8,7 @@ import torch
 from reference import fog, occupancy_sampler
 from torch import Tensor
 
+from dnerf.core.backgrounds import RandomBackground
 from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.rays import Samples
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
@@ -40,6 +41,22 @@ def test_squared_error_is_the_mean_over_rays_and_channels() -> None:
     rgb, target = torch.rand(10, 3), torch.rand(10, 3)
     expected = sum((a - b) ** 2 for a, b in zip(rgb.flatten().tolist(), target.flatten().tolist())) / 30
     assert PhotometricLoss()(shown(rgb), of(target), RENDERER).item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_error_before_any_background_is_the_mean_over_its_colours() -> None:
+    generator = torch.Generator().manual_seed(0)
+    colors, true = torch.rand(2, 10, 3, generator=generator, dtype=torch.float64)
+    opacity, alpha = torch.rand(2, 10, generator=generator, dtype=torch.float64)
+    rgba = torch.cat([true, alpha[:, None]], dim=-1)
+
+    def loss_on(color: float, renderer: Renderer) -> float:
+        rgb, target = colors + (1 - opacity[:, None]) * color, true + (1 - alpha[:, None]) * color
+        return PhotometricLoss()(shown(rgb, opacity), Batch(rgba, target), renderer).item()
+
+    # Simpson's rule is exact: the error is quadratic in the background's colour.
+    mean = (loss_on(0.0, RENDERER) + 4 * loss_on(0.5, RENDERER) + loss_on(1.0, RENDERER)) / 6
+    any_color = Renderer(fog(), StratifiedSampler(4), RandomBackground())
+    assert loss_on(0.5, any_color) == pytest.approx(mean, rel=1e-12)
 
 
 @pytest.mark.parametrize("loss", [PhotometricLoss(), PhotometricLoss("huber")])

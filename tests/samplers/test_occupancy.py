@@ -310,6 +310,7 @@ def test_training_samples_raise_the_maxima_of_their_own_cells() -> None:
     ({"subdivision_weight": 1.0}, r"subdivision_weight must be in \[0, 1\), got 1.0"),
     ({"subdivision_weight": math.nan}, r"subdivision_weight must be in \[0, 1\), got nan"),
     ({"min_weight": 1.0}, r"min_weight must be in \[0, 1\), got 1.0"),
+    ({"chance_weight": 1.0}, r"chance_weight must be in \[0, 1\), got 1.0"),
     ({"min_weight": -3.0}, r"min_weight must be in \[0, 1\), got -3.0"),
     ({"render_subdivision": 0}, "render_subdivision must be > 0"),
     ({"narrow_from": 1.5}, r"narrow_from must be in \[0, 1\]"), ({"filter_joins": 0}, "filter_joins must be > 0"),

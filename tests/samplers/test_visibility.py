@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from reference import FormulaField, fog, occupancy_sampler, ray_weights, rays_towards_origin
 from torch import Tensor
 
-from dnerf.core.compositing import composite
+from dnerf.core.compositing import FieldOutput, composite, render_weights, sum_along_rays
 from dnerf.core.rays import Rays, Samples
 from dnerf.fields import RadianceField
-from dnerf.samplers.visibility import joined, visible_weights
+from dnerf.fields.base import IntervalAware
+from dnerf.samplers.visibility import by_chance, joined, visible_weights
 
 
 class CountingField(FormulaField):
@@ -144,6 +145,71 @@ def test_evaluation_keeps_every_sample_in_occupied_cells() -> None:
     rays = rays_towards_origin(64)
     plain, filtering = (occupancy_sampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=w).eval() for w in (0.0, 1e-2))
     assert torch.equal(plain(rays, ball()).starts, filtering(rays, ball()).starts)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(0, 1), max_size=200), st.integers(0, 1000))
+def test_of_neighbours_as_many_are_taken_as_their_chances_add_up_to(chances: list[float], seed: int) -> None:
+    taken = by_chance(torch.tensor(chances), torch.Generator().manual_seed(seed)).tolist()
+    assert len(taken) == len(chances)
+    for i in range(len(chances)):
+        assert chances[i] > 0 or not taken[i]
+        assert chances[i] < 1 or taken[i]
+        assert abs(sum(taken[: i + 1]) - sum(chances[: i + 1])) < 1 + 1e-6
+
+
+def test_each_is_taken_with_its_chance() -> None:
+    chances = torch.tensor([0.1, 0.6, 0.0, 0.25, 1.0, 0.9])
+    generator = torch.Generator().manual_seed(0)
+    rates = torch.stack([by_chance(chances, generator) for _ in range(4000)]).float().mean(0)
+    torch.testing.assert_close(rates, chances, rtol=0, atol=4 * 0.5 / math.sqrt(4000))  # four standard deviations
+
+
+def test_few_samples_of_thin_fog_stand_for_all() -> None:
+    """In the mean over rays the optical depth and its gradient are those of all samples, at a tenth of their number."""
+    rays, box = rays_towards_origin(400), [[-1.0] * 3, [1.0] * 3]
+    found = []
+    for chance_weight in (0.0, 0.05):
+        sampler = occupancy_sampler(box, 0.02, min_weight=1e-7, chance_weight=chance_weight, pad_to=1).train()
+        density = torch.tensor(0.2, requires_grad=True)
+        samples = sampler(rays, fog(0.2), generator=torch.Generator().manual_seed(0))
+        opacity = 1 - torch.exp(-sum_along_rays(density * samples.lengths, samples))
+        (gradient,) = torch.autograd.grad(opacity.mean(), density)
+        found.append((len(samples.starts), opacity.mean().item(), gradient.item()))
+    (num_all, *exact), (num_few, *estimated) = found
+    assert num_few < 0.1 * num_all
+    # A sample stands for an opacity of 0.05; of about 0.3 along a ray half a sample is uncertain, on 400 rays.
+    assert estimated == pytest.approx(exact, rel=0.01)
+
+
+def test_what_weighs_more_is_taken_as_it_is() -> None:
+    rays, box = rays_towards_origin(64), [[-1.0] * 3, [1.0] * 3]
+    plain, lucky = (
+        occupancy_sampler(box, 0.02, min_weight=1e-4, chance_weight=w, pad_to=1).train()(
+            rays, ball(), generator=torch.Generator().manual_seed(0)
+        )
+        for w in (0.0, 0.02)
+    )
+    density = ball().density(plain.locate(rays)[0], plain.per_sample(rays.times))
+    heavy = plain.kept(render_weights(density * plain.lengths, plain) >= 0.02)
+    is_heavy = torch.isin(lucky.starts, heavy.starts)
+    assert torch.equal(lucky.kept(is_heavy).ends, heavy.ends)
+    assert 0 < len(heavy.starts) <= len(lucky.starts) < len(plain.starts)
+
+
+def test_a_field_that_needs_the_ends_of_intervals_gets_all_of_them() -> None:
+    class Thick(FormulaField, IntervalAware):
+        def between(self, starts: Tensor, ends: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+            return self(0.5 * (starts + ends), directions, times)
+
+    field = Thick(lambda x: torch.full_like(x[..., 0], 0.2), lambda x, d, t: x)
+    plain, lucky = (
+        occupancy_sampler([[-1.0] * 3, [1.0] * 3], 0.02, min_weight=1e-4, chance_weight=w).train()(
+            rays_towards_origin(64), field, generator=torch.Generator().manual_seed(0)
+        )
+        for w in (0.0, 0.02)
+    )
+    assert torch.equal(plain.starts, lucky.starts)
 
 
 @settings(max_examples=60, deadline=None)
