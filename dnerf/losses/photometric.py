@@ -1,8 +1,8 @@
 """How far rendered colours are from the true ones."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
-from dnerf.core.checks import check_choice, check_positive
+from dnerf.core.checks import check_positive
 from dnerf.core.compositing import Rendering
 from dnerf.core.schedules import Schedule
 from dnerf.losses.base import Batch, Loss
@@ -10,29 +10,21 @@ from dnerf.rendering.renderer import Renderer
 
 
 class PhotometricLoss(Loss):
-    """Mean squared or Huber error of colour, of the earlier (coarse) passes as well: NeRF eq. 6.
+    """Mean squared error of colour, of the earlier (coarse) passes as well: NeRF eq. 6.
 
     Where any colour may lie behind (`RandomBackground`), its variance times the squared error of opacity is added.
 
     Args:
-        kind: "mse", or "huber" (quadratic below `delta`, linear above, scaled to agree with the mse for small errors).
-        delta: where Huber turns linear, in units of colour.
         proposal_weight: weight of the coarse passes' errors.
         weight: factor of the term.
 
     Raises:
-        ValueError: for another kind or numbers that are not positive.
+        ValueError: for numbers below zero.
     """
 
-    def __init__(
-        self, kind: str = "mse", *, delta: float = 0.1, proposal_weight: float = 1.0, weight: float | Schedule = 1.0
-    ) -> None:
+    def __init__(self, *, proposal_weight: float = 1.0, weight: float | Schedule = 1.0) -> None:
         super().__init__(weight)
-        check_choice("kind", kind, ("mse", "huber"))
-        check_positive("delta", delta)
         check_positive("proposal_weight", proposal_weight, allow_zero=True)
-        self.kind = kind
-        self.delta = delta
         self.proposal_weight = proposal_weight
 
     def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
@@ -43,9 +35,6 @@ class PhotometricLoss(Loss):
         return loss
 
     def _error(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
-        if self.kind == "mse":
-            errors = nn.functional.mse_loss(rendering.rgb, batch.target, reduction="none")
-        else:
-            errors = 2 * nn.functional.huber_loss(rendering.rgb, batch.target, delta=self.delta, reduction="none")
+        errors = (rendering.rgb - batch.target).square().mean(-1)
         missing = (rendering.opacity - batch.rgba[:, 3]).square()
-        return rendering.mean(errors.mean(-1) + model.background.variance * missing)
+        return rendering.mean(errors + model.background.variance * missing)

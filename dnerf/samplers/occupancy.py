@@ -65,27 +65,21 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         pad_to: int = 2048,
     ) -> None:  # fmt: skip
         super().__init__()
-        render_subdivision = subdivision if render_subdivision is None else render_subdivision
-        for name, count in (
-            ("subdivision", subdivision), ("render_subdivision", render_subdivision), ("filter_joins", filter_joins),
-            ("pad_to", pad_to),
-        ):  # fmt: skip
-            check_whole(name, count)
-        for name, value in (
-            ("subdivision_weight", subdivision_weight), ("min_weight", min_weight), ("chance_weight", chance_weight),
-        ):  # fmt: skip
-            check_within(name, value, "[0, 1)")
-        for name, value in (("subdivide_from", subdivide_from), ("narrow_from", narrow_from)):
-            check_within(name, value, "[0, 1]")
-        for progress in (0.0, 1.0):
-            check_positive("step_size", at(step_size, progress))
         self.grid = grid
         self.step_schedule = step_size
         self.step_size = at(step_size, 1.0)
-        self.subdivision, self.render_subdivision = subdivision, render_subdivision
+        self.subdivision, self.filter_joins, self.pad_to = subdivision, filter_joins, pad_to
+        self.render_subdivision = subdivision if render_subdivision is None else render_subdivision
         self.subdivision_weight, self.min_weight, self.chance_weight = subdivision_weight, min_weight, chance_weight
         self.subdivide_from, self.narrow_from = subdivide_from, narrow_from
-        self.filter_joins, self.pad_to = filter_joins, pad_to
+        for name in ("subdivision", "render_subdivision", "filter_joins", "pad_to"):
+            check_whole(name, getattr(self, name))
+        for name in ("subdivision_weight", "min_weight", "chance_weight"):
+            check_within(name, getattr(self, name), "[0, 1)")
+        for name in ("subdivide_from", "narrow_from"):
+            check_within(name, getattr(self, name), "[0, 1]")
+        for progress in (0.0, 1.0):
+            check_positive("step_size", at(step_size, progress))
         # Of a step in training: a tensor, since graphs that replay steps read it.
         self.length = nn.Buffer(torch.tensor(self.step_size), persistent=False)
         self.set_progress(0.0)
@@ -260,8 +254,7 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         weights = visible_weights(
             joint, rays, field, self.min_weight,
             first_round=FIRST_ROUND, most_at_once=MOST_AT_ONCE, pad_to=self.pad_to, observe=self.observe,
-        )  # fmt: skip
-        weights = weights[number]
+        )[number]  # fmt: skip
         is_visible = ~(weights <= self.min_weight)  # NaN is
         is_visible, samples = self._by_chance(samples, weights, is_visible, field, generator)
         kept, count = samples.kept(is_visible), self.training_subdivision

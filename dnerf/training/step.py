@@ -110,8 +110,7 @@ class Stepper:
             total.backward()
             run.optimizer.step()
         opacity, variance = rendering.opacity.detach(), run.renderer.background.variance
-        errors = (rendering.rgb.detach() - batch.target).square().mean(-1)
-        errors = errors + variance * (opacity - rgba[:, 3]).square()
+        errors = (rendering.rgb.detach() - batch.target).square().mean(-1) + variance * (opacity - rgba[:, 3]).square()
         known = errors if rendering.is_placed is None else torch.where(rendering.is_placed, errors, -1)
         assert rendering.background is not None
         contrast = (batch.target - rendering.background).detach().square().amax(-1)

@@ -179,7 +179,7 @@ class Shine(Loss):
 
 
 def test_losses_add_up_with_their_weights_each_in_its_turn(frames: Frames) -> None:
-    losses = {"rgb": PhotometricLoss("huber", weight=Ramp(1.0, 2.0)), "shine": Shine(0.1, every=3), "none": None}
+    losses = {"rgb": PhotometricLoss(weight=Ramp(1.0, 2.0)), "shine": Shine(0.1, every=3), "none": None}
     records = watched(frames, num_steps=6, losses=losses)
     assert [record.step for record in records if "shine" in record.losses] == [3, 6]
     for record in records:

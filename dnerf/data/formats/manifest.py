@@ -10,18 +10,8 @@ from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics
 from dnerf.data.capture import CaptureFrame, ImageFile
+from dnerf.data.formats import json_files as files
 from dnerf.data.formats.folder import Folder
-from dnerf.data.formats.json_files import (
-    MAX_FRAMES,
-    MAX_NUMBER,
-    matrix,
-    number,
-    numbers,
-    read_object,
-    required,
-    short,
-    text,
-)
 from dnerf.data.formats.keys import TIME_KEYS, check_keys
 from dnerf.data.formats.manifest_cameras import LensFields
 from dnerf.data.formats.points import read_ply
@@ -45,16 +35,16 @@ class Manifest:
 
     def __init__(self, folder: Folder, path: Path) -> None:
         self.folder, self.path = folder, path
-        self.fields = read_object(path)
+        self.fields = files.read_object(path)
         listed = self.fields.pop("frames", None)
         if not isinstance(listed, list) or not listed:
-            raise ValueError(f"{path}: frames must be a list with at least one frame, got {short(listed)}")
-        if len(listed) > MAX_FRAMES:
-            raise ValueError(f"{path}: frames must be at most {MAX_FRAMES}, got {len(listed)}")
+            raise ValueError(f"{path}: frames must be a list with at least one frame, got {files.short(listed)}")
+        if len(listed) > files.MAX_FRAMES:
+            raise ValueError(f"{path}: frames must be at most {files.MAX_FRAMES}, got {len(listed)}")
         check_keys(self.fields, str(path), folder.notes, path.name, of_frame=False)
         for index, frame in enumerate(listed):
             if not isinstance(frame, dict):
-                raise ValueError(f"{self._where(index)} must be an object, got {short(frame)}")
+                raise ValueError(f"{self._where(index)} must be an object, got {files.short(frame)}")
             check_keys(frame, self._where(index), folder.notes, path.name, of_frame=True)
         self.listed: list[dict[str, Any]] = listed
 
@@ -115,7 +105,7 @@ class Manifest:
         frame, where = self.listed[index], self._where(index)
         if cameras_only and frame.get("file_path") is None:
             return None
-        return self.folder.image(required(frame, "file_path", where), f"{where}.file_path")
+        return self.folder.image(files.required(frame, "file_path", where), f"{where}.file_path")
 
     def _mask(self, index: int) -> Path | None:
         value, where = self.listed[index].get("mask_path"), f"{self._where(index)}.mask_path"
@@ -128,7 +118,9 @@ class Manifest:
 
     def _pose(self, index: int) -> Pose:
         where = f"{self._where(index)}.transform_matrix"
-        values = matrix(required(self.listed[index], "transform_matrix", self._where(index)), where, ((4, 4), (3, 4)))
+        values = files.matrix(
+            files.required(self.listed[index], "transform_matrix", self._where(index)), where, ((4, 4), (3, 4))
+        )
         return rigid_pose(values, where, self.path.name, self.folder.notes)
 
     def _times(self) -> Sequence[float | None]:
@@ -142,19 +134,19 @@ class Manifest:
                 raise ValueError(
                     f"{self._where(missing)}.{key} is missing, other frames have it; give it to all, or to none"
                 )
-            return [number(v, f"{self._where(i)}.{key}", -MAX_TIME, MAX_TIME) for i, v in enumerate(values)]
+            return [files.number(v, f"{self._where(i)}.{key}", -MAX_TIME, MAX_TIME) for i, v in enumerate(values)]
         return [None] * len(self.listed)
 
 
 def stated_planes(fields: Mapping[str, Any], path: Path, scale: float = 1.0) -> tuple[float, float] | None:
     """z-depths near and far of a file's fields, divided by a scale; None unless both are there."""
     stated = [
-        number(fields[key], f"{path}: {key}", 0) / scale for key in ("near", "far") if fields.get(key) is not None
+        files.number(fields[key], f"{path}: {key}", 0) / scale for key in ("near", "far") if fields.get(key) is not None
     ]
     if len(stated) < 2:
         return None
     near, far = stated
-    if not near < far <= MAX_NUMBER:
+    if not near < far <= files.MAX_NUMBER:
         raise ValueError(f"{path}: near must be less than far, got {near:g} and {far:g}; correct or remove them")
     return near, far
 
@@ -163,7 +155,7 @@ def color(value: Any, where: str) -> tuple[float, float, float] | None:
     """Three numbers in [0, 1], or None; ValueError for anything else."""
     if value is None:
         return None
-    red, green, blue = numbers(value, where, 3, 0, 1)
+    red, green, blue = files.numbers(value, where, 3, 0, 1)
     return red, green, blue
 
 
@@ -171,10 +163,10 @@ def direction(value: Any, where: str) -> tuple[float, float, float] | None:
     """A unit vector along three numbers, or None; ValueError for anything else, or no length."""
     if value is None:
         return None
-    vector = np.array(numbers(value, where, 3))
+    vector = np.array(files.numbers(value, where, 3))
     length = float(np.linalg.norm(vector))
     if not length > 1e-6:
-        raise ValueError(f"{where} must have a length, got {short(value)}")
+        raise ValueError(f"{where} must have a length, got {files.short(value)}")
     x, y, z = (vector / length).tolist()
     return x, y, z
 
@@ -210,7 +202,7 @@ def named_points(manifest: Manifest) -> Tensor | None:
     if value is None:
         return None
     where = f"{manifest.path}: ply_file_path"
-    path = manifest.folder.root / text(value, where).replace("\\", "/")
+    path = manifest.folder.root / files.text(value, where).replace("\\", "/")
     try:
         return read_ply(manifest.folder.inside(path, where))
     except ValueError as error:

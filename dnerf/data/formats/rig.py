@@ -4,19 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from dnerf.data.capture import Capture, CaptureFrame, ImageFile
+from dnerf.data.formats import json_files as files
 from dnerf.data.formats.folder import Folder
-from dnerf.data.formats.json_files import (
-    MAX_FRAMES,
-    Notes,
-    matrix,
-    number,
-    numbers,
-    read_object,
-    required,
-    short,
-    text,
-    whole,
-)
 from dnerf.data.formats.keys import LENS_KEYS
 from dnerf.data.formats.manifest import color, stated_planes, uniquely_named
 from dnerf.data.formats.manifest_cameras import MAX_SIDE, LensFields
@@ -34,7 +23,7 @@ UP = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 def recognises(root: Path) -> bool:
     """Whether a folder holds `info.json` that lists videos."""
     try:
-        return "train_videos" in read_object(root / "info.json")
+        return "train_videos" in files.read_object(root / "info.json")
     except ValueError:
         return False
 
@@ -45,19 +34,19 @@ def read(root: Path) -> Capture:
     Raises:
         ValueError: in one line that names file and field, for anything missing, malformed or out of range.
     """
-    notes = Notes()
+    notes = files.Notes()
     folder, path = Folder(root, notes), root / "info.json"
-    fields = read_object(path)
+    fields = files.read_object(path)
     splits: dict[str, tuple[CaptureFrame, ...]] = {}
-    left = MAX_FRAMES
+    left = files.MAX_FRAMES
     for split, key in SPLITS.items():
-        videos = fields.get(key) if split != "train" else required(fields, key, str(path))
+        videos = fields.get(key) if split != "train" else files.required(fields, key, str(path))
         if videos is not None and not isinstance(videos, list):
-            raise ValueError(f"{path}: {key} must be a list of videos, got {short(videos)}")
+            raise ValueError(f"{path}: {key} must be a list of videos, got {files.short(videos)}")
         frames: list[CaptureFrame] = []
         for index, video in enumerate(videos or ()):
             if not isinstance(video, dict):
-                raise ValueError(f"{path}: {key}[{index}] must be an object, got {short(video)}")
+                raise ValueError(f"{path}: {key}[{index}] must be an object, got {files.short(video)}")
             frames += _frames(folder, video, fields, f"{path}: {key}[{index}]", left - len(frames))
         left -= len(frames)
         if frames:
@@ -75,7 +64,7 @@ def read(root: Path) -> Capture:
 def _frames(folder: Folder, video: dict[str, Any], shared: dict[str, Any], where: str, most: int) -> list[CaptureFrame]:
     """The frames of one video, at most so many."""
     _note_unknown(video, folder.notes)
-    name = text(required(video, "file_name", where), f"{where}.file_name")
+    name = files.text(files.required(video, "file_name", where), f"{where}.file_name")
     path = folder.inside(folder.root / name, f"{where}.file_name")
     if not path.is_file():
         raise ValueError(f"{where}.file_name: no video {path}; put it there, or remove it from the list")
@@ -86,14 +75,16 @@ def _frames(folder: Folder, video: dict[str, Any], shared: dict[str, Any], where
             found if value is None else value
             for value, found in zip(stated, (header.num_frames, header.fps, [header.height, header.width]))
         ]
-    count = whole(stated[0], f"{where}.frame_num", 1, MAX_FRAMES)
-    rate = number(stated[1], f"{where}.frame_rate", 1e-3, 1e6)
-    height, width = (int(x) for x in numbers(stated[2], f"{where}.camera_hw", 2, 1, MAX_SIDE))
+    count = files.whole(stated[0], f"{where}.frame_num", 1, files.MAX_FRAMES)
+    rate = files.number(stated[1], f"{where}.frame_rate", 1e-3, 1e6)
+    height, width = (int(x) for x in files.numbers(stated[2], f"{where}.camera_hw", 2, 1, MAX_SIDE))
     if count > most:
         raise ValueError(
-            f"{where}.frame_num: frames of all videos must be at most {MAX_FRAMES}, got more; cut the videos"
+            f"{where}.frame_num: frames of all videos must be at most {files.MAX_FRAMES}, got more; cut the videos"
         )
-    values = matrix(required(video, "transform_matrix", where), f"{where}.transform_matrix", ((4, 4), (3, 4)))
+    values = files.matrix(
+        files.required(video, "transform_matrix", where), f"{where}.transform_matrix", ((4, 4), (3, 4))
+    )
     pose = rigid_pose(values, f"{where}.transform_matrix", "info.json", folder.notes)
     lens = LensFields(video, shared, where, str(folder.root / "info.json"))
     intrinsics = lens.intrinsics(*(lens.stated_size() or (width, height)))
@@ -104,6 +95,6 @@ def _frames(folder: Folder, video: dict[str, Any], shared: dict[str, Any], where
     ]
 
 
-def _note_unknown(fields: dict[str, Any], notes: Notes) -> None:
+def _note_unknown(fields: dict[str, Any], notes: files.Notes) -> None:
     for key in sorted(fields.keys() - KNOWN):
-        notes.add(f"info.json: key {short(key)} is not known, it was ignored")
+        notes.add(f"info.json: key {files.short(key)} is not known, it was ignored")
