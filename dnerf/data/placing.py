@@ -14,15 +14,7 @@ from dnerf.data.bounds import check_views, fit_box, opaque_without_room
 from dnerf.data.frames import Frames
 from dnerf.data.normalization import LONGEST_SIDE, Similarity, Vector, upright
 from dnerf.data.scene_record import Box, World
-from dnerf.data.viewpoints import (
-    Viewpoints,
-    choose_up,
-    common_focus,
-    depths_of,
-    find_planes,
-    reach_around,
-    unknown_parts,
-)
+from dnerf.data.viewpoints import Viewpoints, choose_up, common_focus, depths_of, planes_of, reach_around, unknown_parts
 
 DIGITS = 4  # of the longest side, to which a fitted box is rounded, outwards
 DISTANCE = 4.0  # world units from the cameras to what they look at, while the box is being fitted
@@ -131,7 +123,7 @@ def _first_planes(views: Viewpoints, focus: Tensor | None, given: Given) -> tupl
         depth = None if focus is None else float(depths_of(views, focus).median())
         if depth is None or given.planes[0] < depth < given.planes[1]:
             return given.planes
-    near, far, _ = find_planes(views, given.points)
+    near, far, _ = planes_of(views, given.points)
     return near, far
 
 

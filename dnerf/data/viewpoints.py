@@ -120,7 +120,7 @@ def depths_of(views: Viewpoints, point: Tensor) -> Tensor:
     return ((point - views.positions) * views.forward).sum(-1)
 
 
-def find_planes(views: Viewpoints, points: Tensor | None) -> tuple[float, float, str]:
+def planes_of(views: Viewpoints, points: Tensor | None) -> tuple[float, float, str]:
     """z-depths between which the scene lies, in the units of the cameras, and by what they were found."""
     if points is not None and (planes := _planes_of_points(views, points)) is not None:
         return *planes, "from sparse points"

@@ -14,6 +14,7 @@ from dnerf.fields.base import NetworkTabled, NetworkTables, RadianceField, warn_
 from dnerf.fields.head import HeadedField
 from dnerf.fields.space_time import SpaceTimeFeatures
 from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, series_sums, shade
+from dnerf.nn.parameter_groups import ParameterGroup
 
 
 class GridField(HeadedField):
@@ -56,6 +57,10 @@ class GridField(HeadedField):
         self.low = nn.Buffer(corners[0], persistent=False)
         self.scale = nn.Buffer(1 / (corners[1] - corners[0]), persistent=False)
         self.table = nn.Parameter(table)
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """The head's, and the table in "features"."""
+        return [*super().parameter_groups(), ParameterGroup("features", (self.table,))]
 
     def _unit(self, positions: Tensor) -> Tensor:
         """Places (N, 3) in the box, whose corners are 0 and 1."""

@@ -104,7 +104,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         return density, colors.unflatten(0, (3, -1))
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """The networks in "head"; features, which wait long for their turn, are left in "default"."""
+        """The networks in "head"; features, which wait long for their turn, are not among them."""
         return [ParameterGroup("head", tuple(self.head.parameters()))]
 
     def output_labels(self) -> dict[str, list[str]]:

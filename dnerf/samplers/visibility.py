@@ -96,7 +96,6 @@ def visible_weights(
         (N,), zero behind the end of a ray.
     """
     found = torch.zeros_like(samples.starts)
-
     rounds = PackedRounds(samples, pad_to)
 
     def visit(ray_numbers: Tensor, part: Samples, transmittance: Tensor) -> Tensor:
@@ -149,10 +148,8 @@ def joined(samples: Samples, most: int) -> tuple[Samples, Tensor]:
 
 @torch.no_grad()
 def by_chance(chances: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Take samples (N,) with such chances in [0, 1], evenly: of neighbours, as many as their chances add up to.
-
-    Source: systematic sampling (Kitagawa, JCGS 1996), one random number for all.
-    """
+    """Take samples (N,) with such chances in [0, 1]; of neighbours as many as their chances add up to: systematic
+    sampling (Kitagawa, JCGS 1996)."""
     unit = torch.rand((), generator=generator, dtype=torch.float64, device=chances.device)
     sums = torch.nn.functional.pad((chances.cumsum(0, dtype=torch.float64) + unit).floor(), (1, 0))
     return sums.diff() > 0

@@ -39,8 +39,8 @@ def orthogonalized(matrices: Tensor) -> Tensor:
     return x.to(matrices.dtype)
 
 
-class AdamMuon(torch.optim.Adam):
-    """Adam; groups with `orthogonal=True` take Muon's step: momentum, orthogonalised, at the size of Adam's steps.
+class AdamMuon(torch.optim.AdamW):
+    """AdamW, by default without decay; groups with `orthogonal=True` take Muon's step: momentum, orthogonalised.
 
     An orthogonalised step moves all directions of a weight matrix alike, also those that rarely matter to the loss of
     one batch. It finds deformations in fewer steps; tables, biases and last layers are better off with Adam.
@@ -62,7 +62,7 @@ class AdamMuon(torch.optim.Adam):
             for parameter in group["params"]:
                 if group["orthogonal"] and parameter.ndim != 2:
                     raise ValueError(f"orthogonal parameters must be matrices, got shape {tuple(parameter.shape)}")
-        super().__init__(listed, **settings)
+        super().__init__(listed, **{"weight_decay": 0.0, **settings})
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -128,6 +128,8 @@ class AdamSettings:
 
     Args:
         learning_rates: by group, see `dnerf.nn.parameter_groups`; "default" is for all that no name is given for.
+        weight_decays: by group, 0 where none is given; as in AdamW a step shrinks parameters by this times their rate.
+            Matrices that take orthogonalised steps do not decay.
         final_rate: factor on all rates at the end of training, > 0.
         hold_until: progress in [0, 1) until which rates are held.
         warmup_steps: steps over which they rise linearly from near zero.
@@ -143,6 +145,7 @@ class AdamSettings:
         self,
         learning_rates: Mapping[str, float] | None = None,
         *,
+        weight_decays: Mapping[str, float] | None = None,
         final_rate: float = 0.1,
         hold_until: float = 0.0,
         warmup_steps: int = 0,
@@ -152,6 +155,8 @@ class AdamSettings:
     ) -> None:
         self.learning_rates = {DEFAULT: 5e-4} if learning_rates is None else learning_rates
         check_mapping("learning_rates", self.learning_rates, allow_zero=True)
+        self.weight_decays = {} if weight_decays is None else weight_decays
+        check_mapping("weight_decays", self.weight_decays, allow_zero=True)
         if DEFAULT not in self.learning_rates:
             raise ValueError(f"learning_rates must have a rate for {DEFAULT!r}, got {self.learning_rates}")
         check_positive("final_rate", final_rate)
@@ -173,7 +178,7 @@ class AdamSettings:
         listed = []
         for group in groups:
             rate = self.learning_rates.get(group.name, self.learning_rates[DEFAULT])
-            rates = {"lr": rate, "initial_lr": rate}
+            rates = {"lr": rate, "initial_lr": rate, "weight_decay": self.weight_decays.get(group.name, 0.0)}
             listed.append({"params": group.parameters, **rates, "orthogonal": group.orthogonal and self.orthogonal})
         return AdamMuon(listed, betas=self.betas, eps=self.epsilon, fused=True)
 

@@ -13,8 +13,8 @@ from dnerf.data.viewpoints import (
     Viewpoints,
     choose_up,
     common_focus,
-    find_planes,
     measured_up,
+    planes_of,
     reach_around,
     unknown_parts,
 )
@@ -69,13 +69,13 @@ def test_a_few_cameras_that_look_elsewhere_do_not_move_the_focus() -> None:
 
 
 def test_planes_are_around_what_cameras_look_at() -> None:
-    near, far, by = find_planes(views(moved(around())), None)
+    near, far, by = planes_of(views(moved(around())), None)
     assert (near, far) == pytest.approx((100, 300), rel=1e-2)
     assert by == "from what the cameras look at"
 
 
 def test_planes_follow_sparse_points() -> None:
-    near, far, by = find_planes(views(moved(around())), 5 * torch.randn(400, 3) + torch.tensor([9.0, -4.0, 7.0]))
+    near, far, by = planes_of(views(moved(around())), 5 * torch.randn(400, 3) + torch.tensor([9.0, -4.0, 7.0]))
     assert 140 < near < 160
     assert 240 < far < 270
     assert by == "from sparse points"
@@ -88,7 +88,7 @@ def test_cameras_side_by_side_or_looking_outwards_have_no_focus() -> None:
     )
     for poses in (rows, outwards.double()):
         assert common_focus(views(poses)) is None
-        assert "guessed" in find_planes(views(poses), None)[2]
+        assert "guessed" in planes_of(views(poses), None)[2]
 
 
 def test_cameras_that_go_around_something_reach_half_as_far_again_in_any_units() -> None:
@@ -139,6 +139,6 @@ def test_cameras_side_by_side_far_from_the_origin_are_no_single_camera() -> None
     away = moved(rows, torch.eye(3).double(), 1.0, (4e5, 5e6, 100.0))
     own = views(away)
     assert unknown_parts(own, common_focus(own)) is None
-    near, far, by = find_planes(own, None)
+    near, far, by = planes_of(own, None)
     assert (near, far) == pytest.approx((2.0, 40.0))
     assert "guessed" in by

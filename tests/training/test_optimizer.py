@@ -99,6 +99,20 @@ def test_rates_are_those_of_declared_groups_and_declared_matrices_take_orthogona
     assert {(group["lr"], group["orthogonal"]) for group in plain.param_groups} == {(1e-3, False), (0.0, False)}
 
 
+def test_features_that_images_do_not_hold_are_forgotten_at_the_pace_of_their_rate() -> None:
+    renderer = small_renderer()
+    optimizer = AdamSettings({"default": 0.1, "head": 0.1}, weight_decays={"features": 2.0}).build(renderer)
+    before = {name: parameter.detach().clone() for name, parameter in renderer.named_parameters()}
+    for parameter in renderer.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    for rate in (1.0, 0.5):
+        optimizer.set_rates(rate)
+        optimizer.step()
+    for name, parameter in renderer.named_parameters():
+        kept = (1 - 0.2) * (1 - 0.1) if name == "field.canonical.table" else 1.0
+        torch.testing.assert_close(parameter.detach(), kept * before[name])
+
+
 def test_rates_rise_are_held_and_fall() -> None:
     settings = AdamSettings(final_rate=0.01, hold_until=0.5, warmup_steps=9)
     assert [settings.factor(step, 0.0) for step in (0, 4, 9, 20)] == pytest.approx([0.1, 0.5, 1.0, 1.0])
@@ -113,6 +127,7 @@ def test_rates_rise_are_held_and_fall() -> None:
         (lambda: AdamSettings({"default": "fast"}), "learning_rates.default must be a number, got 'fast'"),
         (lambda: AdamSettings({"default": -1e-3}), "learning_rates.default must be >= 0 and finite, got -0.001"),
         (lambda: AdamSettings({"head": 1e-3}), "learning_rates must have a rate for 'default', got"),
+        (lambda: AdamSettings(weight_decays={"head": -1.0}), "weight_decays.head must be >= 0 and finite, got -1.0"),
         (lambda: AdamSettings(final_rate=0.0), "final_rate must be > 0"),
         (lambda: AdamSettings(hold_until=1.0), r"hold_until must be in \[0, 1\), got 1.0"),
         (lambda: AdamSettings(warmup_steps=1.5), "warmup_steps must be a whole number, got 1.5"),
