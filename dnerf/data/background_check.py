@@ -18,7 +18,7 @@ def data_background(frames: Frames) -> tuple[list[float] | None, str]:
     one colour; where they show something everywhere, it hardly matters.
     """
     if frames.is_transparent:
-        return None, "any in training, since the images have alpha"
+        return None, "any colour in training, since the images have alpha"
     if frames.background is not None:
         color = list(parse_color(frames.background))
         return color, f"{_rounded(torch.tensor(color))}, as the data set states"

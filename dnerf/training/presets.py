@@ -53,7 +53,7 @@ def make_renderer(
         box: (2, 3) corners of what is modelled, in world units, see `fit_box`.
         deformation: world -> canonical, in place of the displacement network.
         field: canonical, in place of the grid.
-        background: any in training, white in images if None, which needs frames with alpha.
+        background: any colour in training, white in images if None, which needs frames with alpha.
 
     Raises:
         ValueError: for a box that is none.

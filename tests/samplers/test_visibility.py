@@ -14,6 +14,7 @@ from dnerf.core.compositing import FieldOutput, composite, render_weights, sum_a
 from dnerf.core.rays import Rays, Samples
 from dnerf.fields import RadianceField
 from dnerf.fields.base import IntervalAware
+from dnerf.samplers.base import Capacity
 from dnerf.samplers.visibility import by_chance, joined, visible_weights
 
 
@@ -165,17 +166,21 @@ def test_each_is_taken_with_its_chance() -> None:
     torch.testing.assert_close(rates, chances, rtol=0, atol=4 * 0.5 / math.sqrt(4000))  # four standard deviations
 
 
-def test_few_samples_of_thin_fog_stand_for_all() -> None:
+@pytest.mark.parametrize("is_fixed", [False, True])
+def test_few_samples_of_thin_fog_stand_for_all(is_fixed: bool) -> None:
     """In the mean over rays the optical depth and its gradient are those of all samples, at a tenth of their number."""
     rays, box = rays_towards_origin(400), [[-1.0] * 3, [1.0] * 3]
     found = []
     for chance_weight in (0.0, 0.05):
         sampler = occupancy_sampler(box, 0.02, min_weight=1e-7, chance_weight=chance_weight, pad_to=1).train()
-        density = torch.tensor(0.2, requires_grad=True)
-        samples = sampler(rays, fog(0.2), generator=torch.Generator().manual_seed(0))
+        density, generator = torch.tensor(0.2, requires_grad=True), torch.Generator().manual_seed(0)
+        if is_fixed:
+            samples = sampler.sample_fixed(rays, fog(0.2), Capacity(1 << 17, 1 << 17), generator=generator)
+        else:
+            samples = sampler(rays, fog(0.2), generator=generator)
         opacity = 1 - torch.exp(-sum_along_rays(density * samples.lengths, samples))
         (gradient,) = torch.autograd.grad(opacity.mean(), density)
-        found.append((len(samples.starts), opacity.mean().item(), gradient.item()))
+        found.append((int((samples.lengths > 0).sum()), opacity.mean().item(), gradient.item()))
     (num_all, *exact), (num_few, *estimated) = found
     assert num_few < 0.1 * num_all
     # A sample stands for an opacity of 0.05; of about 0.3 along a ray half a sample is uncertain, on 400 rays.
