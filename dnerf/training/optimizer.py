@@ -39,8 +39,8 @@ def orthogonalized(matrices: Tensor) -> Tensor:
     return x.to(matrices.dtype)
 
 
-class AdamMuon(torch.optim.AdamW):
-    """AdamW, by default without decay; groups with `orthogonal=True` take Muon's step: momentum, orthogonalised.
+class AdamMuon(torch.optim.Adam):
+    """Adam; groups with `orthogonal=True` take Muon's step: momentum, orthogonalised.
 
     An orthogonalised step moves all directions of a weight matrix alike, also those that rarely matter to the loss of
     one batch. It finds deformations in fewer steps; tables, biases and last layers are better off with Adam.
@@ -62,7 +62,7 @@ class AdamMuon(torch.optim.AdamW):
             for parameter in group["params"]:
                 if group["orthogonal"] and parameter.ndim != 2:
                     raise ValueError(f"orthogonal parameters must be matrices, got shape {tuple(parameter.shape)}")
-        super().__init__(listed, **{"weight_decay": 0.0, **settings})
+        super().__init__(listed, **settings)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -128,8 +128,8 @@ class AdamSettings:
 
     Args:
         learning_rates: by group, see `dnerf.nn.parameter_groups`; "default" is for all that no name is given for.
-        weight_decays: by group, 0 where none is given; as in AdamW a step shrinks parameters by this times their rate.
-            Matrices that take orthogonalised steps do not decay.
+        weight_decays: by group, 0 where none is given: so many times itself joins a parameter's gradient. Adam divides
+            by the gradients' size: with a small number what images say nothing of falls to zero, and little else moves.
         final_rate: factor on all rates at the end of training, > 0.
         hold_until: progress in [0, 1) until which rates are held.
         warmup_steps: steps over which they rise linearly from near zero.

@@ -107,7 +107,7 @@ def make_trainer(
     }
     optimizer = AdamSettings(
         {"default": 2e-2, "deformation": 6e-3, "deformation_output": 1.5e-3, "head": 5e-3},
-        weight_decays={"features": 0.2}, final_rate=0.05, hold_until=0.3, warmup_steps=20, betas=(0.9, 0.99),
+        weight_decays={"features": 1e-8}, final_rate=0.05, hold_until=0.3, warmup_steps=20, betas=(0.9, 0.99),
         epsilon=1e-15, orthogonal=True,
     )  # fmt: skip
     if callbacks is None:
