@@ -23,7 +23,6 @@ LEAST_FRAMES = 8  # of the training split, below which none is held out
 NUM_RAYS = 8192  # of a comparison
 SPAN = 0.05  # of all steps done, over which weights are averaged for a comparison: steps of one size are noisy
 AVERAGE = "average"  # callback
-STANDARD_ERRORS = 2.0  # by which a richer candidate must be better than the one that stands
 
 
 @dataclass(frozen=True)
@@ -174,7 +173,7 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simp
     """Train all, halving the number of challengers until one is left.
 
     The first contender is the one that stands. A simpler one wins if it is better, a richer one only if it is better by
-    two standard errors.
+    a standard error (the rule of Breiman et al. 1984 for trees: the simplest that the best does not clearly beat).
 
     Args:
         contenders: at least two, the default first.
@@ -207,7 +206,7 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simp
     best = min(left, key=lambda c: float(c.errors.mean()))
     if best is not standing:
         mean, error = gain(best.errors, standing.errors)
-        if mean > (0 if best.choice in simpler and math.isfinite(error) else STANDARD_ERRORS * error):
+        if mean > (0 if best.choice in simpler and math.isfinite(error) else error):
             return Result(best, mean, error, seconds)
         return Result(standing, -mean, error, seconds)
     second = min((c for c in left if c is not standing), key=lambda c: float(c.errors.mean()))

@@ -125,7 +125,7 @@ def test_contest_finds_the_candidate_that_learns_and_keeps_the_standing_one_of_e
     assert contest(contenders("slow", "slow"), pixels, Effort(10, 0.0)).winner.choice == "slow"
 
 
-def test_a_simpler_candidate_wins_by_being_better_a_richer_one_by_two_standard_errors() -> None:
+def test_a_simpler_candidate_wins_by_being_better_a_richer_one_by_a_standard_error() -> None:
     class Known:
         """A contender whose errors are given."""
 
@@ -140,12 +140,13 @@ def test_a_simpler_candidate_wins_by_being_better_a_richer_one_by_two_standard_e
 
     held = MagicMock()
     held.within.return_value = held
-    standing, other = Known("default", 1.0, 2.0, 1.0), Known("other", 1.1, 1.5, 1.0)
-    mean, error = gain(other.errors, standing.errors)
-    assert 0 < mean < 2 * error
-    both = [standing, other]
-    assert contest(both, held, Effort(1, 0.0)).winner is standing  # type: ignore[arg-type]
-    assert contest(both, held, Effort(1, 0.0), ["other"]).winner is other  # type: ignore[arg-type]
+    standing, near, clear = Known("default", 1.0, 2.0, 1.0), Known("near", 1.4, 1.5, 1.0), Known("clear", 1.1, 1.5, 0.9)
+    (mean, error), (more, spread) = (gain(other.errors, standing.errors) for other in (near, clear))
+    assert 0 < mean < error
+    assert spread < more < 2 * spread
+    assert contest([standing, near], held, Effort(1, 0.0)).winner is standing  # type: ignore[list-item]
+    assert contest([standing, clear], held, Effort(1, 0.0)).winner is clear  # type: ignore[list-item]
+    assert contest([standing, near], held, Effort(1, 0.0), ["near"]).winner is near  # type: ignore[list-item]
     one = [Known("default", 2.0), Known("other", 1.0)]
     assert contest(one, held, Effort(1, 0.0), ["other"]).winner is one[0]  # type: ignore[arg-type]
 

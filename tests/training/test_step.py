@@ -15,6 +15,7 @@ from small_runs import Watch, weights
 from torch import Tensor, nn
 
 from dnerf import kernels
+from dnerf.core.backgrounds import RandomBackground
 from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.schedules import Ramp
 from dnerf.data import Frames, SyntheticData
@@ -116,6 +117,19 @@ def test_rays_without_places_are_not_taken_for_wrong_ones(marched: int, kept: in
     assert result.errors[is_known].max() < 1e-4
     assert result.scalars["mse"] < 1e-4
     assert result.scalars["opacity"] > 0.99
+
+
+def test_opacity_counts_in_errors_and_contrast_before_any_background() -> None:
+    """Grey fog before grey: where images show nothing it looks right there, and wrong before other colours."""
+    images = SyntheticData(make_scene("walker"), 8, num_train=2).frames("train")
+    grey = torch.tensor([127, 127, 127, 255], dtype=torch.uint8).repeat(2, 8, 8, 1)
+    grey[1] = 0
+    renderer = Renderer(Fog(), occupancy_sampler(BOX, 0.3, 8, min_weight=0.01), RandomBackground())
+    nn.init.constant_(renderer.field.color, 127 / 255)
+    result = stepper(renderer, replace(images, images=grey), terms={"rgb": PhotometricLoss()})(torch.arange(128))
+    expected = torch.tensor([0.0, 1 / 12]).repeat_interleave(64)
+    torch.testing.assert_close(result.errors, expected, atol=1e-4, rtol=0)
+    assert float(result.scalars["contrast"]) == pytest.approx(0.5 * (1 / 12) ** 0.5, abs=2e-3)
 
 
 def test_fixed_places_teach_what_others_teach(frames: Frames) -> None:
