@@ -130,6 +130,7 @@ class AdamSettings:
         learning_rates: by group, see `dnerf.nn.parameter_groups`; "default" is for all that no name is given for.
         weight_decays: by group, 0 where none is given: so many times itself joins a parameter's gradient. Adam divides
             by the gradients' size: with a small number what images say nothing of falls to zero, and little else moves.
+            Matrices that take orthogonalised steps have no decay.
         final_rate: factor on all rates at the end of training, > 0.
         hold_until: progress in [0, 1) until which rates are held.
         warmup_steps: steps over which they rise linearly from near zero.
