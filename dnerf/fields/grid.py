@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import as_box, check_positive, check_shape, check_whole
-from dnerf.core.compositing import FieldOutput, at_least_float32
+from dnerf.core.compositing import FieldOutput
 from dnerf.core.geometry import cubes, in_unit_cube
 from dnerf.core.spherical_harmonics import spherical_harmonics
 from dnerf.deformations.base import check_one_time, check_positions_times
@@ -36,10 +36,9 @@ class GridField(HeadedField):
 
     def __init__(
         self, box: Sequence[Sequence[float]], resolutions: Sequence[int] = (16, 32, 64, 128), num_features: int = 8, *,
-        max_rows: int = 1 << 17, hidden_features: int = 64, num_layers: int = 2, time_frequencies: int | None = None,
-        temporal_terms: int = 1, space_time: SpaceTimeFeatures | None = None, view_degree: int | None = None,
-        one_color: bool = False, density_activation: str = "exp", density_shift: float = -1.0,
-        window_end: float | None = None,
+        max_rows: int = 1 << 17, hidden_features: int = 64, num_layers: int = 2, temporal_terms: int = 1,
+        space_time: SpaceTimeFeatures | None = None, view_degree: int | None = None, one_color: bool = False,
+        density_shift: float = -1.0, window_end: float | None = None,
     ) -> None:  # fmt: skip
         check_positive("num_features", num_features)
         for resolution in resolutions:
@@ -49,8 +48,7 @@ class GridField(HeadedField):
         table = torch.empty(levels.num_rows, num_features).uniform_(-1e-2, 1e-2)
         super().__init__(
             levels.num_levels, num_features, hidden_features=hidden_features, num_layers=num_layers,
-            time_frequencies=time_frequencies, temporal_terms=temporal_terms, space_time=space_time,
-            view_degree=view_degree, one_color=one_color, density_activation=density_activation,
+            temporal_terms=temporal_terms, space_time=space_time, view_degree=view_degree, one_color=one_color,
             density_shift=density_shift, window_end=window_end,
         )  # fmt: skip
         self.levels = levels
@@ -79,18 +77,9 @@ class GridField(HeadedField):
         values = grid_network(self._unit(positions), self.table, self.levels, weights, biases)
         return values.reshape(*positions.shape[:-1], len(bias))
 
-    def _grid_layers(self, time: Tensor | None = None) -> tuple[list[Tensor], list[Tensor]] | None:
-        """Weights and biases of the head's hidden layers, if they see the table's features and nothing else; at one
-        time () what they see of it is part of the first biases."""
-        if self.space_time is not None or (self.encode_times is not None and time is None):
-            return None
-        layers = self.head.relu_parameters(self._input_scale)
-        if layers is None or self.encode_times is None or time is None:
-            return layers
-        encoded = self.encode_times(time[None])
-        (first, *weights), (bias, *biases) = layers
-        of_table, of_time = first.tensor_split([first.shape[1] - len(encoded)], dim=1)
-        return [of_table, *weights], [bias + of_time @ encoded, *biases]
+    def _grid_layers(self) -> tuple[list[Tensor], list[Tensor]] | None:
+        """Weights and biases of the head's hidden layers, if they see the table's features and nothing else."""
+        return None if self.space_time is not None else self.head.relu_parameters(self._input_scale)
 
     def at_time(self, time: float, extent: Tensor | None = None) -> RadianceField:
         """The same with what depends on time alone summed up."""
@@ -98,8 +87,7 @@ class GridField(HeadedField):
 
 
 class GridFieldAtTime(RadianceField, NetworkTabled):
-    """A grid field at one time, for images: its series in time are summed up in the head's last layer, and its head's
-    encoding of the time is part of the first one's biases, not of every sample.
+    """A grid field at one time, for images: its series in time are summed up in the head's last layer.
 
     Args:
         field: what is evaluated.
@@ -118,16 +106,13 @@ class GridFieldAtTime(RadianceField, NetworkTabled):
         weight, bias = (part.detach() for part in field._last)
         with torch.autocast(now.device.type, enabled=False):
             waves = field._waves(now).to(weight.dtype)
-            self.layers = field._grid_layers(now)
+            self.layers = field._grid_layers()
             self.weight = nn.Buffer(field._at_one_time(weight, waves))
             self.bias = nn.Buffer(field._at_one_time(bias[:, None], waves)[:, 0])
 
     def network_tables(self) -> NetworkTables | None:
-        """Its tables; None, and a warning, for another density than the exponential one, features of space and time,
-        or a head without hidden layers."""
+        """Its tables; None, and a warning, for features of space and time, or a head without hidden layers."""
         field = self.field
-        if field.density_activation != "exp":
-            return warn_of_generic_path(f"density_activation={field.density_activation}, only exp")
         if self.layers is None:
             return warn_of_generic_path("num_layers=0" if field.space_time is None else "space_time features")
         return NetworkTables(
@@ -157,15 +142,12 @@ class GridFieldAtTime(RadianceField, NetworkTabled):
     @torch.no_grad()
     def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
         """Density (...,) and rgb (..., 3) at positions (..., 3), directions (..., 3) and times (...,)."""
-        is_exponential, degree = self.field.density_activation == "exp", self.field.view_degree
-        nothing = torch.zeros_like(self.bias)
-        within, after = (nothing, self.bias) if is_exponential else (self.bias, nothing)
-        values = self._linear(positions, times, self.weight, within)
+        degree = self.field.view_degree
+        after: Tensor = self.bias
+        values = self._linear(positions, times, self.weight, torch.zeros_like(self.bias))
         if degree:
             check_shape("directions", directions, positions.shape)
             basis = spherical_harmonics(directions.reshape(-1, 3), degree)
             values, after = series_sums(values + after, basis), after.new_zeros(4)
-        if not is_exponential:
-            return self.field._activated_values(at_least_float32(values.reshape(*times.shape, 4)))
         density, rgb = shade(values, after, self.field.density_shift)
         return FieldOutput(density.reshape(times.shape), rgb.reshape(positions.shape))

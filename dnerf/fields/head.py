@@ -15,7 +15,6 @@ from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField, TimeDependence
 from dnerf.fields.space_time import SpaceTimeFeatures
 from dnerf.kernels import series_sums
-from dnerf.nn.encodings import SinusoidalEncoding
 from dnerf.nn.mlp import MLP
 from dnerf.nn.parameter_groups import DeclaresGroups, HasOutputLabels, ParameterGroup
 
@@ -35,10 +34,8 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         num_features: of each level.
         hidden_features: width of the head.
         num_layers: hidden layers of the head.
-        time_frequencies: octaves of a time encoding that the head sees; None for a head that does not depend on time.
         temporal_terms: terms K of a cosine series in time, cos(k pi t) for k < K, that density and colour follow before
-            their activations: folds and shading that change with motion. 1 for what is carried along
-            and never changes.
+            their activations: folds and shading that change with motion. 1 for what is carried and never changes.
         space_time: features of place and time that the head sees, too: for what moves too fast, or in too many ways,
             for a deformation to follow. None for a head that does not see any.
         view_degree: degree, 0 to 4, of spherical harmonics of the direction that colour follows before its activation,
@@ -46,8 +43,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
             matte ones. None or 0 for matte.
         one_color: whether colour is the same everywhere, as of smoke; it may still follow time and direction. Then only
             density explains what is bright and what is dim, as in tomography.
-        density_activation: "softplus" or "exp".
-        density_shift: added before the activation; negative for a thin start.
+        density_shift: added before the exponential that gives density; negative for a thin start.
         window_end: fraction of training, in (0, 1], at which every level is in; finer levels fade in one after the
             other, so that a deformation is first found by coarse shapes, whose gradients reach far (Nerfies, arXiv
             2011.12948, eq. 8, for grids). None for all levels from the start.
@@ -58,30 +54,22 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
 
     def __init__(
         self, num_levels: int, num_features: int, *, hidden_features: int = 64, num_layers: int = 2,
-        time_frequencies: int | None = None, temporal_terms: int = 1, space_time: SpaceTimeFeatures | None = None,
-        view_degree: int | None = None, one_color: bool = False, density_activation: str = "exp",
-        density_shift: float = -1.0, window_end: float | None = None,
+        temporal_terms: int = 1, space_time: SpaceTimeFeatures | None = None, view_degree: int | None = None,
+        one_color: bool = False, density_shift: float = -1.0, window_end: float | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         check_positive("temporal_terms", temporal_terms)
         check_choice("view_degree", view_degree or 0, DEGREES)
         check_within("window_end", window_end, "(0, 1]", or_none=True)
         self.num_features = num_features
-        self.density_activation = density_activation
         self.density_shift = density_shift
         self.window_end = window_end
         self.window = nn.Buffer((torch.arange(num_levels) == 0).float(), persistent=window_end is not None)
-        self.encode_times = None if time_frequencies is None else SinusoidalEncoding(1, time_frequencies)
-        self.space_time = space_time
+        self.space_time, self.one_color = space_time, one_color
         self.temporal_terms = temporal_terms
         self.view_degree = view_degree or 0
-        self.one_color = one_color
         self.orders = nn.Buffer(torch.arange(temporal_terms), persistent=False)
-        in_features = num_features * num_levels
-        if self.encode_times is not None:
-            in_features += self.encode_times.out_features
-        if space_time is not None:
-            in_features += space_time.out_features
+        in_features = num_features * num_levels + (0 if space_time is None else space_time.out_features)
         color_terms = temporal_terms + (self.view_degree + 1) ** 2 - 1
         self.head = MLP(in_features, hidden_features, num_layers, out_features=temporal_terms + 3 * color_terms)
         with torch.no_grad():  # a fresh series begins without the terms that change
@@ -96,7 +84,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
     @property
     def is_static(self) -> bool:
         """Whether neither the head nor its series sees times."""
-        return self.encode_times is None and self.space_time is None and self.temporal_terms == 1
+        return self.space_time is None and self.temporal_terms == 1
 
     def _series(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
         """Of density (D, ...) and of colours (3, K, ...): parts of what the head has for each output."""
@@ -137,17 +125,10 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
 
     def _seen(self, positions: Tensor, times: Tensor) -> Tensor:
         """What the head's last layer sees (..., n)."""
-        inputs = [self._features(positions, times)]
-        if self.encode_times is not None:
-            inputs.append(self.encode_times(times[..., None]))
+        features = self._features(positions, times)
         if self.space_time is not None:
-            inputs.append(self.space_time(positions, times))
-        joined = torch.cat(inputs, dim=-1) if len(inputs) > 1 else inputs[0]
-        return self.head.before_output(joined, self._input_scale)
-
-    def _raw(self, positions: Tensor, times: Tensor) -> Tensor:
-        """The head's outputs."""
-        return self._linear(positions, times, *self._last)
+            features = torch.cat([features, self.space_time(positions, times)], dim=-1)
+        return self.head.before_output(features, self._input_scale)
 
     @property
     def _last(self) -> tuple[Tensor, Tensor]:
@@ -159,7 +140,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         return weight, bias
 
     def _activated(self, raw: Tensor) -> Tensor:
-        return activate_density(raw, self.density_activation, self.density_shift)
+        return activate_density(raw, "exp", self.density_shift)
 
     def _at(self, series: Tensor, times: Tensor) -> Tensor:
         """Values (..., n) of series (..., n K) at times (...,), or at one time ()."""
@@ -181,7 +162,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         """What the head says of density alone (..., K)."""
         check_positions_times(positions, times)
         if not self.view_degree:
-            return self._raw(positions, times)[..., : self.temporal_terms]
+            return self._linear(positions, times, *self._last)[..., : self.temporal_terms]
         # Colours have many terms.
         return self._linear(positions, times, *(self._series(part)[0] for part in self._last))
 
@@ -190,7 +171,7 @@ class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels
         check_positions_times(positions, times)
         if self.view_degree:
             check_shape("directions", directions, positions.shape)
-        raw = self._raw(positions, times)
+        raw = self._linear(positions, times, *self._last)
         if not self.view_degree:
             return at_least_float32(self._at(raw, times))
         with torch.autocast(raw.device.type, enabled=False):

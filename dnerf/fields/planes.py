@@ -76,14 +76,12 @@ class PlanesField(HeadedField):
     def __init__(
         self, planes: PlaneFeatures, *, hidden_features: int = 64, num_layers: int = 2,
         temporal_terms: int = 1, space_time: SpaceTimeFeatures | None = None, view_degree: int | None = None,
-        one_color: bool = False, density_activation: str = "exp", density_shift: float = -1.0,
-        window_end: float | None = None,
+        one_color: bool = False, density_shift: float = -1.0, window_end: float | None = None,
     ) -> None:  # fmt: skip
         super().__init__(
             planes.num_levels, planes.out_features // planes.num_levels, hidden_features=hidden_features,
             num_layers=num_layers, temporal_terms=temporal_terms, space_time=space_time, view_degree=view_degree,
-            one_color=one_color, density_activation=density_activation, density_shift=density_shift,
-            window_end=window_end,
+            one_color=one_color, density_shift=density_shift, window_end=window_end,
         )  # fmt: skip
         self.planes = planes
 

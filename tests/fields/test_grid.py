@@ -49,18 +49,9 @@ def test_parts_that_are_not_asked_for_do_not_exist() -> None:
         return {name.split(".")[0] for name, _ in small(**options).named_modules() if name}
 
     assert keys() == {"head"}
-    assert keys(time_frequencies=2) == {"head", "encode_times"}
     assert keys(view_degree=1) == {"head"}
     assert small(view_degree=1).head.out_features == 1 + 3 * 4
     assert small(view_degree=2, temporal_terms=4).head.out_features == 4 + 3 * (4 + 8)
-
-
-def test_time_features_let_a_place_change_with_time() -> None:
-    positions = torch.rand(20, 3) + torch.tensor([0.0, 0.0, 3.0])
-    for options, changes in (({}, False), ({"time_frequencies": 2}, True)):
-        field = small(**options)
-        first, last = field.density(positions, torch.zeros(20)), field.density(positions, torch.ones(20))
-        assert torch.equal(first, last) != changes
 
 
 @pytest.mark.parametrize(("view_degree", "one_color"), [(None, False), (1, False), (None, True)])
@@ -197,11 +188,9 @@ def test_a_window_outside_the_training_is_refused(end: float) -> None:
 
 
 def test_what_depends_on_time_alone_is_summed_up_for_images() -> None:
-    glossy = small(temporal_terms=3, time_frequencies=2, view_degree=1).at_time(0.3)
+    glossy = small(temporal_terms=3, view_degree=1).at_time(0.3)
     assert isinstance(glossy, GridFieldAtTime)
     assert glossy.weight.shape == (1 + 3 * 4, 16)
-    assert glossy.layers is not None
-    assert glossy.layers[0][0].shape == (16, 4)  # of the table's features, not of times
     frozen = small(temporal_terms=3).at_time(0.3)
     assert isinstance(frozen, GridFieldAtTime)
     assert frozen.weight.shape == (4, 16)  # of the head's sixteen to density and colour, not to 4 x 3 terms
@@ -209,8 +198,7 @@ def test_what_depends_on_time_alone_is_summed_up_for_images() -> None:
         frozen.density(torch.zeros(4, 3), torch.full((4,), 0.5))
 
 
-@pytest.mark.parametrize("options", [{}, {"view_degree": 2}, {"view_degree": 1, "time_frequencies": 2},
-                                     {"view_degree": 2, "one_color": True}])  # fmt: skip
+@pytest.mark.parametrize("options", [{}, {"view_degree": 2}, {"view_degree": 2, "one_color": True}])
 def test_tables_for_the_frame_kernel_are_all_that_the_field_shows(options: dict) -> None:
     field = small(temporal_terms=3, window_end=1.0, **options)
     field.set_progress(0.6)
@@ -228,7 +216,7 @@ def test_tables_for_the_frame_kernel_are_all_that_the_field_shows(options: dict)
 
 
 @pytest.mark.parametrize(("options", "part"), [
-    ({"density_activation": "softplus"}, "density_activation=softplus"), ({"num_layers": 0}, "num_layers=0"),
+    ({"num_layers": 0}, "num_layers=0"),
     ({"space_time": SpaceTimeVolumes(BOX, (4,), (3,))}, "space_time features"),
 ])  # fmt: skip
 def test_parts_that_the_frame_kernel_does_not_serve_are_named_once(
@@ -243,13 +231,12 @@ def test_parts_that_the_frame_kernel_does_not_serve_are_named_once(
 def test_what_is_no_level_is_seen_whatever_the_window() -> None:
     volumes = SpaceTimeVolumes(BOX, (4,), (3,), num_features=2)
     positions = torch.rand(30, 3) + torch.tensor([0.0, 0.0, 3.0])
-    for options in ({"time_frequencies": 2}, {"space_time": volumes}, {"time_frequencies": 2, "space_time": volumes}):
-        field = small(window_end=1.0, **options)
-        for table in volumes.tables:
-            torch.nn.init.normal_(table)
-        field.set_progress(0.0)
-        first, last = (field.density(positions, torch.full((30,), time)) for time in (0.1, 0.8))
-        assert float((first - last).detach().abs().max()) > 1e-3
+    field = small(window_end=1.0, space_time=volumes)
+    for table in volumes.tables:
+        torch.nn.init.normal_(table)
+    field.set_progress(0.0)
+    first, last = (field.density(positions, torch.full((30,), time)) for time in (0.1, 0.8))
+    assert float((first - last).detach().abs().max()) > 1e-3
 
 
 def test_levels_that_are_not_in_yet_are_not_seen() -> None:

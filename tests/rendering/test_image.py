@@ -85,7 +85,6 @@ def fused(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
 @vectors
 @pytest.mark.parametrize("options", [
     {"temporal_terms": 1}, {}, {"view_degree": 2}, {"temporal_terms": 1, "view_degree": 4},
-    {"time_frequencies": 2, "view_degree": 1},
 ])  # fmt: skip
 @pytest.mark.parametrize("subdivision", [1, 3])
 def test_the_fused_kernel_shows_what_the_generic_path_shows(

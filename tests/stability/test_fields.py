@@ -19,7 +19,7 @@ from dnerf.nn.encodings import SinusoidalEncoding
 BOX = [[-1.5] * 3, [1.5] * 3]
 FIELDS = {
     "nerf": lambda: NeRFField(4, 64, (2,), view_dependent=True),
-    "grid": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, view_degree=3, time_frequencies=4),
+    "grid": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, view_degree=3, temporal_terms=4),
     "grid, changing": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, temporal_terms=4),
     "grid, space-time": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, space_time=SpaceTimeVolumes(BOX)),
     "deformed": lambda: DeformedField(moving(), GridField(BOX, (8, 16), 8)),
