@@ -93,7 +93,8 @@ def decide(
 
     watching = {name: config.trainer.callbacks.get(name) for name in ("recovery", "progress_bar")}
     callbacks = {name: build(node, trusted=True) for name, node in watching.items() if node is not None}
-    return make_plan(parts, given, make, frames, seed=config.seed, share=config.plan.share, callbacks=callbacks)
+    box = torch.tensor(config.box)
+    return make_plan(parts, given, make, frames, box, seed=config.seed, share=config.plan.share, callbacks=callbacks)
 
 
 def _key(override: str) -> str:

@@ -7,7 +7,6 @@ import torch
 
 from dnerf.core.geometry import ray_box
 from dnerf.data.background_check import SAME_LEVELS, background_color
-from dnerf.data.bounds import fit_box
 from dnerf.data.carving import EVERY_PIXEL, Silhouettes
 from dnerf.data.frames import Frames
 from dnerf.data.pixel_layout import evenly_spread
@@ -20,6 +19,7 @@ NOT_CLEAR = 2  # alpha, of 255, from which a pixel shows something, be it fog
 AGREEMENT = 0.98  # share of the views in which one position is not empty, so that a body at rest explains a ray
 MAX_CAMERAS = 8  # that do not move, as rigs for tomography have: more tell what is thin from what is dark
 MIXTURES = 0.995  # share of the pixels: some of a compressed film have other colours
+CELLS = {"coarse": 64, "medium": 128, "fine": 256, "finest": 512}  # of a grid's last level
 CLEAR_SHARE = 0.01  # of rays without such a position: fewer may be faults of single images
 
 
@@ -36,8 +36,8 @@ class Evidence(ABC):
     """Looks at the training frames and may decide a part."""
 
     @abstractmethod
-    def find(self, frames: Frames) -> Finding | None:
-        """What the images say; None where they do not decide."""
+    def find(self, frames: Frames, box: torch.Tensor) -> Finding | None:
+        """What the images say of what is modelled in a box (2, 3); None where they do not decide."""
 
 
 class MotionEvidence(Evidence):
@@ -48,16 +48,32 @@ class MotionEvidence(Evidence):
     since a body may turn inside its outline, but rest stands until a trial says otherwise.
     """
 
-    def find(self, frames: Frames) -> Finding | None:
+    def find(self, frames: Frames, box: torch.Tensor) -> Finding | None:
         """See `Evidence.find`."""
         if len(frames.times.unique()) == 1:
             return Finding("still", "all frames have one time")
         if not frames.is_transparent:
             return None
-        share = unexplained_share(frames)
+        share = unexplained_share(frames, box)
         if share <= CLEAR_SHARE:
             return Finding("still", "all outlines agree with a body at rest", is_certain=False)
         return Finding("moves", f"{100 * share:.0f} % of the outlines contradict a body at rest")
+
+
+class DetailEvidence(Evidence):
+    """How fine a grid has to be: candidates "coarse", "medium", "fine", "finest", with 64 to 512 cells along the box.
+
+    Cells of the last level are no smaller than a pixel at the box's middle (median of the cameras): nobody sees finer.
+    """
+
+    def find(self, frames: Frames, box: torch.Tensor) -> Finding:
+        """See `Evidence.find`."""
+        side = float((box[1] - box[0]).max())
+        distances = (frames.poses[:, :3, 3] - box.mean(0)).norm(dim=-1).clamp(min=side / 2)
+        focal = distances.new_tensor([lens.focal_x for lens in frames.intrinsics])
+        pixels = float((side * focal / distances).median())
+        fit = [name for name, cells in CELLS.items() if cells <= pixels] or list(CELLS)[:1]
+        return Finding(fit[-1], f"the box is {pixels:.0f} pixels long")
 
 
 class SurroundingsEvidence(Evidence):
@@ -66,7 +82,7 @@ class SurroundingsEvidence(Evidence):
     Images with alpha, or before one plain colour, show a scene that stands alone; others show something everywhere.
     """
 
-    def find(self, frames: Frames) -> Finding:
+    def find(self, frames: Frames, box: torch.Tensor) -> Finding:
         """See `Evidence.find`."""
         if frames.is_transparent:
             return Finding("alone", "the images have alpha")
@@ -84,7 +100,7 @@ class ColorsEvidence(Evidence):
     frames of the same cameras, where clouds of their own do well. A grey body before black is taken for smoke, too.
     """
 
-    def find(self, frames: Frames) -> Finding:
+    def find(self, frames: Frames, box: torch.Tensor) -> Finding:
         """See `Evidence.find`."""
         behind = None if frames.is_transparent else background_color(frames)
         if behind is None:
@@ -106,11 +122,11 @@ def mixture_share(frames: Frames, behind: torch.Tensor) -> float:
     return float(((away - (away @ color).clamp(min=0)[:, None] * color).norm(dim=-1) <= SAME_LEVELS).float().mean())
 
 
-def unexplained_share(frames: Frames) -> float:
+def unexplained_share(frames: Frames, box: torch.Tensor) -> float:
     """The share of outlines' rays without a position that nearly all views see as not empty."""
     views = frames if len(frames) <= MAX_VIEWS else frames.subset(evenly_spread(len(frames), MAX_VIEWS))
     rays = Silhouettes.of(views).outlines()[1]
-    enter, leave = ray_box(rays.origins, rays.directions, fit_box(frames))
+    enter, leave = ray_box(rays.origins, rays.directions, box)
     enter, leave = enter.maximum(rays.near), leave.minimum(rays.far)
     kept = (enter < leave).nonzero()[:, 0]
     kept = kept[:: max(1, -(-len(kept) // MAX_RAYS))]

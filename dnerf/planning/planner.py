@@ -4,6 +4,8 @@ import math
 import time
 from collections.abc import Mapping
 
+from torch import Tensor
+
 from dnerf.data.frames import Frames
 from dnerf.planning.evidence import Finding
 from dnerf.planning.parts import Part
@@ -22,6 +24,7 @@ def make_plan(
     given: Mapping[str, str],
     make: Maker,
     frames: Frames,
+    box: Tensor,
     *,
     seed: int = 0,
     share: float = 0.1,
@@ -38,6 +41,7 @@ def make_plan(
         given: choices that stand already, by part.
         make: builds model and trainer for choices by part.
         frames: the training split.
+        box: (2, 3) corners of what is modelled.
         seed: of the trials' draws.
         share: of the training's seconds, or steps, for trials.
         callbacks: around the steps of the model that stands, until it is the final one; none if None.
@@ -46,16 +50,16 @@ def make_plan(
         plan: decisions for all parts.
         run: of the model that `make` builds for them, some steps in; None if no trial was needed.
     """
-    return _Planner(parts, given, make, frames, seed, share, callbacks or {}).decide()
+    return _Planner(parts, given, make, frames, box, seed, share, callbacks or {}).decide()
 
 
 class _Planner:
     def __init__(
-        self, parts: Mapping[str, Part], given: Mapping[str, str], make: Maker, frames: Frames, seed: int,
-        share: float, callbacks: Mapping[str, Callback],
+        self, parts: Mapping[str, Part], given: Mapping[str, str], make: Maker, frames: Frames, box: Tensor,
+        seed: int, share: float, callbacks: Mapping[str, Callback],
     ) -> None:  # fmt: skip
         self.parts, self.make, self.frames, self.seed, self.share = parts, make, frames, seed, share
-        self.callbacks = callbacks
+        self.callbacks, self.box = callbacks, box.to(frames.poses)
         self.lost_steps = 0  # of all losers
         self.decisions: dict[str, Decision] = {}
         self.standing = {name: Finding(part.default, "") for name, part in parts.items()}
@@ -72,7 +76,7 @@ class _Planner:
             self.decisions[name] = Decision(given, "given", "as set")
         elif not part.arises(self._choices()):
             self.decisions[name] = Decision(part.simplest, "default", "the question does not arise")
-        elif part.evidence is not None and (finding := part.evidence.find(self.frames)) is not None:
+        elif part.evidence is not None and (finding := part.evidence.find(self.frames, self.box)) is not None:
             seconds = time.perf_counter() - begin
             if finding.is_certain:
                 self.decisions[name] = Decision(finding.choice, "images", finding.why, seconds=seconds)
@@ -152,11 +156,12 @@ class _Planner:
     def _effort(self, leading: Contender, num_others: int, num_left: int) -> Effort:
         """What each candidate may spend for the budget's share to suffice."""
         limits, run = leading.trainer.limits, leading.run
+        rounds = num_others.bit_length()  # of challengers that are halved
+        runs = num_left * sum(num_others >> i for i in range(rounds)) / rounds
         if limits.max_seconds is None:
             left = self.share * limits.num_steps - self.lost_steps
-            return Effort(min(int(left / num_left / num_others), MOST_STEPS), 0.0)
+            return Effort(min(int(left / runs), MOST_STEPS), 0.0)
         each = run.seconds / run.step
         spent = sum(decision.seconds for decision in self.decisions.values() if decision.by == "trial")
-        budget = (self.share * limits.max_seconds - spent) / num_left
-        num_steps = min(int(budget / num_others / each), MOST_STEPS)
+        num_steps = min(int((self.share * limits.max_seconds - spent) / runs / each), MOST_STEPS)
         return Effort(num_steps, num_steps * each)

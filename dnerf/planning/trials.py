@@ -169,14 +169,25 @@ class Result:
     seconds: float  # that comparisons took
 
 
+def _ranked(contenders: Sequence[Contender]) -> list[Contender]:
+    """From the best to the worst, where the simplest comes first of those that the best does not clearly beat."""
+    left, ranked = list(contenders), []
+    while left:
+        best = min(left, key=lambda c: float(c.errors.mean()))
+        gains = (gain(best.errors, c.errors) for c in left)
+        ranked.append(left.pop(next(i for i, (mean, error) in enumerate(gains) if mean <= error)))
+    return ranked
+
+
 def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simpler: Collection[str] = ()) -> Result:
     """Train all, halving the number of challengers until one is left.
 
     The first contender is the one that stands. A simpler one wins if it is better, a richer one only if it is better by
     a standard error (the rule of Breiman et al. 1984 for trees: the simplest that the best does not clearly beat).
+    Among challengers the same rule tells who stays.
 
     Args:
-        contenders: at least two, the default first.
+        contenders: at least two, the default first, the others from the simplest to the richest.
         held: what they are compared on.
         effort: of each until the last comparison, in as many rounds as there are halvings.
         simpler: choices that are simpler than the default.
@@ -184,7 +195,7 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simp
     left, seconds = list(contenders), 0.0
     for contender in contenders:
         contender.begin()
-    num_rounds = max(1, math.ceil(math.log2(len(left))))
+    num_rounds = (len(left) - 1).bit_length()
     for _ in range(num_rounds):
         for contender in left:
             contender.advance(effort.divided(num_rounds))
@@ -198,16 +209,11 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simp
             contender.compare(inside)
         seconds += time.perf_counter() - begin
         if len(left) > 2:
-            others = sorted(left[1:], key=lambda c: float(c.errors.mean()))
-            left = [left[0], *others[: len(others) // 2]]  # the one that stands is compared to the end
+            left = [left[0], *_ranked(left[1:])[: len(left[1:]) // 2]]  # the one that stands is compared to the end
     for contender in contenders:
         contender.end()
-    standing = contenders[0]
-    best = min(left, key=lambda c: float(c.errors.mean()))
-    if best is not standing:
-        mean, error = gain(best.errors, standing.errors)
-        if mean > (0 if best.choice in simpler and math.isfinite(error) else error):
-            return Result(best, mean, error, seconds)
-        return Result(standing, -mean, error, seconds)
-    second = min((c for c in left if c is not standing), key=lambda c: float(c.errors.mean()))
-    return Result(standing, *gain(standing.errors, second.errors), seconds)
+    standing, other = left
+    mean, error = gain(other.errors, standing.errors)
+    if mean > (0 if other.choice in simpler and math.isfinite(error) else error):
+        return Result(other, mean, error, seconds)
+    return Result(standing, -mean, error, seconds)

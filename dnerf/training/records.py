@@ -9,6 +9,8 @@ from torch import nn
 
 from dnerf.core.checks import check_positive, check_whole
 
+OPENING = 0.3  # of progress: by then all frames and levels are in, and rates begin to fall
+
 
 @dataclass(frozen=True)
 class TrainingRecord:
@@ -37,22 +39,31 @@ def not_finite(model: nn.Module, *, gradients: bool = False) -> list[str]:
 
 @dataclass(frozen=True)
 class Limits:
-    """When training ends, after most steps or seconds (None for any), and when a record is made; all positive."""
+    """When training ends (None for any), when a record is made, and how many steps an opening has at most; positive."""
 
     num_steps: int
     max_seconds: float | None
     log_every: int
+    opening_steps: int | None = None
 
     def __post_init__(self) -> None:
         check_whole("num_steps", self.num_steps)
         check_whole("log_every", self.log_every)
+        check_whole("opening_steps", 1 if self.opening_steps is None else self.opening_steps)
         if self.max_seconds is not None:
             check_positive("max_seconds", self.max_seconds)
 
     def progress(self, step: int, seconds: float) -> float:
-        """How much of training is over, in [0, 1]: of its steps or of its seconds, whichever is more."""
+        """How much of training is over, in [0, 1]: of its steps or of its seconds, whichever is more.
+
+        An opening of so many steps ends at the progress `OPENING`, sooner than that share of a long training.
+        """
         of_time = 0.0 if self.max_seconds is None else seconds / self.max_seconds
-        return min(max(step / self.num_steps, of_time), 1.0)
+        done = min(max(step / self.num_steps, of_time), 1.0)
+        if self.opening_steps is None or not step:
+            return done
+        opening = min(OPENING, self.opening_steps * done / step)  # the share that so many steps take
+        return OPENING * done / opening if done < opening else 1 - (1 - OPENING) * (1 - done) / (1 - opening)
 
     def is_finished(self, step: int, seconds: float) -> bool:
         """Whether no step is left, or no time."""

@@ -34,10 +34,11 @@ logger = logging.getLogger(__name__)
 class Trainer:
     """Adam on random rays until `num_steps` or `max_seconds` is reached, whichever comes first.
 
-    Progress p in [0, 1] is the larger of steps done / num_steps and seconds spent / max_seconds; all that changes
-    during training follows it, so a time-limited run still ends with a finished schedule. It never falls: what has
-    opened stays open when a run is continued for longer. Seconds are those of the steps themselves: loading, compiling
-    kernels and what callbacks do (checkpoints, copies for recovery, logs, previews) do not count.
+    Progress p in [0, 1] is the larger of steps done / num_steps and seconds spent / max_seconds, but in a long training
+    its first part is sooner over (`opening_steps`). All that changes during training follows it, so a time-limited run
+    still ends with a finished schedule. It never falls: what has opened stays open when a run is continued for longer.
+    Seconds are those of the steps themselves: loading, compiling kernels and what callbacks do (checkpoints, copies for
+    recovery, logs, previews) do not count.
 
     Args:
         num_steps: most optimiser steps.
@@ -54,6 +55,8 @@ class Trainer:
         graphs: samples in fixed numbers of places, whatever rays meet, so that on a GPU steps are replayed as CUDA
             graphs. For samplers of `FixedCapacity`, with `target_samples`.
         marched_per_sample: then, intervals in occupied cells for which there are places, per sample.
+        opening_steps: by which a progress of 0.3 is reached at the latest, however long training is: until then frames
+            and levels come in and rates are high, which wants steps enough, and harms when it lasts. None for any.
 
     Raises:
         ValueError: for numbers out of range, or parts of another kind.
@@ -74,6 +77,7 @@ class Trainer:
         log_every: int = 20,
         graphs: bool = False,
         marched_per_sample: float = 3.0,
+        opening_steps: int | None = None,
     ) -> None:
         target = 1 if target_samples is None else target_samples
         for name, value in (("num_rays", num_rays), ("max_rays", max_rays), ("target_samples", target)):
@@ -81,7 +85,7 @@ class Trainer:
         check_positive("marched_per_sample", marched_per_sample)
         if graphs and target_samples is None:
             raise ValueError("target_samples must be given with graphs, got null")
-        self.limits = Limits(num_steps, max_seconds, log_every)
+        self.limits = Limits(num_steps, max_seconds, log_every, opening_steps)
         self.num_rays, self.target_samples, self.max_rays = num_rays, target_samples, max_rays
         self.losses = nn.ModuleDict(_of_kind("losses", {"rgb": PhotometricLoss()} if losses is None else losses, Loss))
         self.pixels = UniformPixels() if pixels is None else pixels

@@ -8,23 +8,21 @@ from unittest.mock import MagicMock
 
 import pytest
 import torch
-from small_runs import BOX, small_frames, small_renderer, small_trainer, weights
+from small_runs import BOX as CORNERS
+from small_runs import small_frames, small_renderer, small_trainer, weights
 
 from dnerf.core.backgrounds import RandomBackground
+from dnerf.core.cameras import Intrinsics, look_at
 from dnerf.data import Frames, SyntheticData
 from dnerf.fields import GridField
-from dnerf.planning import (
+from dnerf.planning import Decision, Evidence, Finding, Part, Plan, make_plan
+from dnerf.planning.evidence import (
     ColorsEvidence,
-    Decision,
-    Evidence,
-    Finding,
+    DetailEvidence,
     MotionEvidence,
-    Part,
-    Plan,
     SurroundingsEvidence,
-    make_plan,
-)  # fmt: skip
-from dnerf.planning.evidence import mixture_share
+    mixture_share,
+)
 from dnerf.planning.plan import fingerprint, load_plan
 from dnerf.planning.planner import LEAST_STEPS
 from dnerf.planning.trials import Contender, Effort, HeldOut, contest, gain, split_frames
@@ -33,6 +31,7 @@ from dnerf.samplers import OccupancyGrid, OccupancySampler
 from dnerf.scenes import make_scene
 from dnerf.training import AdamSettings, Trainer
 
+BOX = torch.tensor(CORNERS)
 CANDIDATES = {"slow": [], "quick": ["a.b=1"]}
 
 
@@ -42,24 +41,24 @@ def frames_of(scene: str, num_frames: int = 24, size: int = 64) -> Frames:
 
 @pytest.mark.parametrize("scene", ["walker", "orbiting_balls", "snowman", "merging_balls"])
 def test_silhouettes_prove_motion(scene: str) -> None:
-    finding = MotionEvidence().find(frames_of(scene))
+    finding = MotionEvidence().find(frames_of(scene), BOX)
     assert finding is not None
     assert (finding.choice, finding.is_certain) == ("moves", True)
 
 
 def test_silhouettes_of_a_body_at_rest_leave_it_at_rest_until_a_trial() -> None:
-    finding = MotionEvidence().find(frames_of("static"))
+    finding = MotionEvidence().find(frames_of("static"), BOX)
     assert finding is not None
     assert (finding.choice, finding.is_certain) == ("still", False)
 
 
 def test_frames_of_one_time_are_still_for_certain_and_opaque_ones_tell_nothing() -> None:
     frames = frames_of("walker", 8, 16)
-    still = MotionEvidence().find(replace(frames, times=torch.full_like(frames.times, 0.25)))
+    still = MotionEvidence().find(replace(frames, times=torch.full_like(frames.times, 0.25)), BOX)
     assert still is not None
     assert (still.choice, still.is_certain) == ("still", True)
     opaque = replace(frames, images=frames.images[..., :3].contiguous())
-    assert MotionEvidence().find(opaque) is None
+    assert MotionEvidence().find(opaque, BOX) is None
 
 
 def test_gain_is_the_ratio_of_whole_errors_for_equal_ratios_and_has_no_spread_then() -> None:
@@ -147,6 +146,10 @@ def test_a_simpler_candidate_wins_by_being_better_a_richer_one_by_a_standard_err
     assert contest([standing, near], held, Effort(1, 0.0)).winner is standing  # type: ignore[list-item]
     assert contest([standing, clear], held, Effort(1, 0.0)).winner is clear  # type: ignore[list-item]
     assert contest([standing, near], held, Effort(1, 0.0), ["near"]).winner is near  # type: ignore[list-item]
+    worse = Known("worse", 1.8, 2.9, 1.9)
+    assert contest([worse, standing, near], held, Effort(1, 0.0)).winner is standing  # type: ignore[list-item]
+    assert contest([worse, near, standing], held, Effort(1, 0.0)).winner is near  # type: ignore[list-item]
+    assert contest([worse, standing, clear], held, Effort(1, 0.0)).winner is clear  # type: ignore[list-item]
     one = [Known("default", 2.0), Known("other", 1.0)]
     assert contest(one, held, Effort(1, 0.0), ["other"]).winner is one[0]  # type: ignore[arg-type]
 
@@ -156,7 +159,7 @@ def part(**changes: object) -> Part:
 
 
 def test_trial_decides_and_its_winner_is_trained_on() -> None:
-    plan, run = make_plan({"rate": part()}, {}, make, small_frames(24), share=0.05)
+    plan, run = make_plan({"rate": part()}, {}, make, small_frames(24), BOX, share=0.05)
     decision = plan.decisions["rate"]
     assert (decision.choice, decision.by) == ("quick", "trial")
     assert run is not None
@@ -175,7 +178,7 @@ def test_candidates_are_made_without_what_does_not_arise_with_them() -> None:
         return make(choices)
 
     richer = Part("what else", CANDIDATES, "quick", at=0.3, only_if={"rate": "slow"})
-    plan, run = make_plan({"rate": part(), "other": richer}, {}, noting, small_frames(24), share=0.05)
+    plan, run = make_plan({"rate": part(), "other": richer}, {}, noting, small_frames(24), BOX, share=0.05)
     assert made == [{"rate": "slow", "other": "quick"}, {"rate": "quick", "other": "slow"}]
     assert run is not None
     assert plan.choices == made[-1]  # whose run goes on
@@ -183,11 +186,23 @@ def test_candidates_are_made_without_what_does_not_arise_with_them() -> None:
 
 def test_images_that_show_something_everywhere_have_surroundings() -> None:
     frames = frames_of("walker", 8, 16)
-    assert SurroundingsEvidence().find(frames).choice == "alone"
+    assert SurroundingsEvidence().find(frames, BOX).choice == "alone"
     opaque = replace(frames, images=frames.images[..., :3].contiguous())
-    assert SurroundingsEvidence().find(opaque).choice == "alone"  # before white, or black
+    assert SurroundingsEvidence().find(opaque, BOX).choice == "alone"  # before white, or black
     noise = torch.randint(256, opaque.images.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    assert SurroundingsEvidence().find(replace(opaque, images=noise)).choice == "surrounded"
+    assert SurroundingsEvidence().find(replace(opaque, images=noise), BOX).choice == "surrounded"
+
+
+@pytest.mark.parametrize(
+    ("width", "choice"), [(40, "coarse"), (71, "coarse"), (170, "medium"), (330, "fine"), (513, "finest")]
+)
+def test_cells_are_no_smaller_than_a_pixel(width: int, choice: str) -> None:
+    """Cameras at distance 4 whose images are as wide as 2.4 there: a box with sides of 2.4 fills them."""
+    lens = Intrinsics(width, width, width / 0.6, width / 0.6)
+    poses = torch.stack([look_at(eye).float() for eye in ((4, 0, 0), (0, -4, 0), (0, 0.1, 4))])
+    frames = Frames(torch.zeros(3, width, width, 4, dtype=torch.uint8), poses, torch.tensor([0.0, 0.5, 1.0]), lens)
+    box = torch.tensor([[-1.2, -1.0, -0.5], [1.2, 1.0, 0.5]])
+    assert DetailEvidence().find(frames, box).choice == choice
 
 
 def test_smoke_of_one_colour_before_few_cameras_is_told_from_all_else() -> None:
@@ -204,14 +219,15 @@ def test_smoke_of_one_colour_before_few_cameras_is_told_from_all_else() -> None:
     smoke = torch.tensor([0.9, 0.8, 0.5]).expand(12, 16, 16, 3)
     two = torch.where(torch.arange(16)[:, None] < 8, smoke, torch.tensor([0.1, 0.9, 0.2]))
     both_sides = torch.where(torch.arange(16)[:, None] < 8, smoke, 2 * behind - smoke).clamp(0, 1)
-    assert ColorsEvidence().find(before_plain(smoke)).choice == "one"
+    assert ColorsEvidence().find(before_plain(smoke), BOX).choice == "one"
     for other in (two, both_sides):
-        assert ColorsEvidence().find(before_plain(other)).choice == "many"
-    assert ColorsEvidence().find(before_plain(smoke, frames.poses)).choice == "many"  # twelve viewpoints
-    assert ColorsEvidence().find(before_plain(smoke).subset([0, 1, 2, 3])).choice == "many"  # an image of each camera
-    assert ColorsEvidence().find(frames).choice == "many"  # with alpha
+        assert ColorsEvidence().find(before_plain(other), BOX).choice == "many"
+    assert ColorsEvidence().find(before_plain(smoke, frames.poses), BOX).choice == "many"  # twelve viewpoints
+    one_each = before_plain(smoke).subset([0, 1, 2, 3])  # an image of each camera
+    assert ColorsEvidence().find(one_each, BOX).choice == "many"
+    assert ColorsEvidence().find(frames, BOX).choice == "many"  # with alpha
     noise = torch.randint(256, (12, 16, 16, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
-    everywhere = ColorsEvidence().find(replace(before_plain(smoke), images=noise))
+    everywhere = ColorsEvidence().find(replace(before_plain(smoke), images=noise), BOX)
     assert (everywhere.choice, everywhere.is_certain) == ("many", True)  # no trial may say otherwise
     assert mixture_share(before_plain(smoke), behind) == 1
     assert mixture_share(before_plain(two), behind) < 0.8
@@ -219,7 +235,7 @@ def test_smoke_of_one_colour_before_few_cameras_is_told_from_all_else() -> None:
 
 def test_trials_of_several_parts_share_one_budget() -> None:
     parts = {name: part() for name in ("first", "second", "third")}
-    plan, _ = make_plan(parts, {}, make, small_frames(24), share=0.09)
+    plan, _ = make_plan(parts, {}, make, small_frames(24), BOX, share=0.09)
     steps = [int(plan.decisions[name].why.split()[0]) for name in parts]
     assert all(number >= LEAST_STEPS for number in steps)
     assert sum(steps) <= 0.09 * 800
@@ -227,27 +243,27 @@ def test_trials_of_several_parts_share_one_budget() -> None:
 
 def test_nothing_is_trained_for_what_is_given_seen_cannot_be_tried_or_does_not_arise() -> None:
     class Sees(Evidence):
-        def find(self, frames: Frames) -> Finding:
+        def find(self, frames: Frames, box: torch.Tensor) -> Finding:
             return Finding("quick", "one sees it")
 
     parts = {"given": part(), "seen": part(evidence=Sees()), "other": part(only_if={"seen": "slow"})}
-    plan, run = make_plan(parts, {"given": "quick"}, make, small_frames(24))
+    plan, run = make_plan(parts, {"given": "quick"}, make, small_frames(24), BOX)
     assert run is None
     assert plan.choices == {"given": "quick", "seen": "quick", "other": "slow"}
     assert [plan.decisions[name].by for name in parts] == ["given", "images", "default"]
-    plan, run = make_plan({"rate": part()}, {}, make, small_frames(6))
+    plan, run = make_plan({"rate": part()}, {}, make, small_frames(6), BOX)
     assert run is None
     assert "too few" in plan.decisions["rate"].why
-    plan, _ = make_plan({"rate": part()}, {}, make, small_frames(24), share=0.001)
+    plan, _ = make_plan({"rate": part()}, {}, make, small_frames(24), BOX, share=0.001)
     assert "budget" in plan.decisions["rate"].why
 
 
 def test_uncertain_evidence_stands_where_nothing_is_tried() -> None:
     class Guesses(Evidence):
-        def find(self, frames: Frames) -> Finding:
+        def find(self, frames: Frames, box: torch.Tensor) -> Finding:
             return Finding("quick", "it looks so", is_certain=False)
 
-    plan, _ = make_plan({"rate": part(evidence=Guesses())}, {}, make, small_frames(6))
+    plan, _ = make_plan({"rate": part(evidence=Guesses())}, {}, make, small_frames(6), BOX)
     assert (plan.choices["rate"], plan.decisions["rate"].by) == ("quick", "images")
 
 

@@ -39,6 +39,7 @@ from dnerf.training import (
     Trainer,
     TrainingStopped,
 )
+from dnerf.training.records import Limits
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +88,18 @@ def test_time_limit_ends_training_and_its_schedule(frames: Frames) -> None:
     assert 0.5 <= record.seconds < 5
     # The last step was taken just before the limit, so its factor is near the schedule's end, 0.1.
     assert record.learning_rate_factor < 0.3
+
+
+def test_an_opening_has_so_many_steps_of_a_long_training_and_a_share_of_a_short_one() -> None:
+    long, short = Limits(1000, None, 1, opening_steps=100), Limits(200, None, 1, opening_steps=100)
+    assert [long.progress(step, 0.0) for step in (0, 50, 100, 550, 1000)] == pytest.approx([0, 0.15, 0.3, 0.65, 1])
+    for step in (0, 20, 60, 130, 200):
+        assert short.progress(step, 0.0) == pytest.approx(step / 200)
+    timed = Limits(10**9, 100.0, 1, opening_steps=100)  # a step takes 0.1 s, from the 400th on 0.2 s
+    seconds = [0.1 * step + 0.1 * max(0, step - 400) for step in range(701)]
+    progress = [timed.progress(step, at) for step, at in enumerate(seconds)]
+    assert [progress[0], progress[50], progress[100], progress[700]] == pytest.approx([0, 0.15, 0.3, 1])
+    assert min(later - sooner for sooner, later in pairwise(progress)) > 0
 
 
 def test_records_come_every_so_many_steps_and_at_the_end_and_callbacks_take_no_time(frames: Frames) -> None:
@@ -286,7 +299,10 @@ def test_a_random_background_needs_alpha() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        *(({name: 0}, f"{name} must be > 0") for name in ("num_steps", "num_rays", "max_rays", "max_seconds")),
+        *(
+            ({name: 0}, f"{name} must be > 0")
+            for name in ("num_steps", "num_rays", "max_rays", "max_seconds", "opening_steps")
+        ),
         *(({name: 0}, f"{name} must be > 0") for name in ("target_samples", "log_every", "marched_per_sample")),
         ({"num_rays": 100.5}, "num_rays must be a whole number, got 100.5"),
         ({"graphs": True}, "target_samples must be given with graphs, got null"),
