@@ -210,13 +210,10 @@ def constancy(canonical: RadianceField, count: int = 5000, color: float = 1.0) -
     return AppearanceConstancyLoss(1.0, count, length=0.1, color=color)(rendering(count), BATCH, renderer)
 
 
-@pytest.mark.parametrize(
-    "options", [{"temporal_terms": 3}, {"temporal_terms": 3, "view_degree": 1}, {"time_frequencies": 2}]
-)
+@pytest.mark.parametrize("options", [{"temporal_terms": 3}, {"temporal_terms": 3, "view_degree": 1}])
 def test_change_has_a_price_and_constant_appearance_none(options: dict) -> None:
     grid = GridField([[-1.0] * 3, [1.0] * 3], (4,), 2, density_shift=3.0, **options).double()
-    begins_constant = "temporal_terms" in options
-    assert (constancy(grid).item() < 1e-20) == begins_constant
+    assert constancy(grid).item() < 1e-20
     torch.nn.init.normal_(grid.head.output.weight)
     torch.nn.init.normal_(grid.head.output.bias)
     loss = constancy(grid)
