@@ -118,12 +118,11 @@ class _Planner:
             self.decisions[name] = self._untried(name, "the budget is too small to try")
             return
         others = [choice for choice in part.candidates if choice != standing]
-        simpler = others[: list(part.candidates).index(standing)]
         leading.choice = standing
         forked = (leading.forked(c, self.make, self._choices(**{name: c}), learnt, self.seed) for c in others)
         contenders = [leading, *forked]
         before, first = [contender.run.seconds for contender in contenders], leading.run.step
-        result = contest(contenders, HeldOut.of(held, self.seed), effort, simpler)
+        result = contest(contenders, HeldOut.of(held, self.seed), effort)
         winner = result.winner
         losers = [(c, seconds) for c, seconds in zip(contenders, before, strict=True) if c is not winner]
         lost = result.seconds + sum(loser.run.seconds - seconds for loser, seconds in losers)
@@ -156,12 +155,11 @@ class _Planner:
     def _effort(self, leading: Contender, num_others: int, num_left: int) -> Effort:
         """What each candidate may spend for the budget's share to suffice."""
         limits, run = leading.trainer.limits, leading.run
-        rounds = num_others.bit_length()  # of challengers that are halved
-        runs = num_left * sum(num_others >> i for i in range(rounds)) / rounds
         if limits.max_seconds is None:
             left = self.share * limits.num_steps - self.lost_steps
-            return Effort(min(int(left / runs), MOST_STEPS), 0.0)
+            return Effort(min(int(left / num_left / num_others), MOST_STEPS), 0.0)
         each = run.seconds / run.step
         spent = sum(decision.seconds for decision in self.decisions.values() if decision.by == "trial")
-        num_steps = min(int((self.share * limits.max_seconds - spent) / runs / each), MOST_STEPS)
+        budget = (self.share * limits.max_seconds - spent) / num_left
+        num_steps = min(int(budget / num_others / each), MOST_STEPS)
         return Effort(num_steps, num_steps * each)

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -169,28 +169,16 @@ class Result:
     seconds: float  # that comparisons took
 
 
-def _ranked(contenders: Sequence[Contender]) -> list[Contender]:
-    """From the best to the worst, where the simplest comes first of those that the best does not clearly beat."""
-    left, ranked = list(contenders), []
-    while left:
-        best = min(left, key=lambda c: float(c.errors.mean()))
-        gains = (gain(best.errors, c.errors) for c in left)
-        ranked.append(left.pop(next(i for i, (mean, error) in enumerate(gains) if mean <= error)))
-    return ranked
-
-
-def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simpler: Collection[str] = ()) -> Result:
+def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort) -> Result:
     """Train all, halving the number of challengers until one is left.
 
-    The first contender is the one that stands. A simpler one wins if it is better, a richer one only if it is better by
-    a standard error (the rule of Breiman et al. 1984 for trees: the simplest that the best does not clearly beat).
-    Among challengers the same rule tells who stays.
+    The first contender is the one that stands. Another one wins if it is better by a standard error: Breiman et al.
+    (1984) ask as much of a larger tree.
 
     Args:
-        contenders: at least two, the default first, the others from the simplest to the richest.
+        contenders: at least two, the default first.
         held: what they are compared on.
         effort: of each until the last comparison, in as many rounds as there are halvings.
-        simpler: choices that are simpler than the default.
     """
     left, seconds = list(contenders), 0.0
     for contender in contenders:
@@ -209,11 +197,10 @@ def contest(contenders: Sequence[Contender], held: HeldOut, effort: Effort, simp
             contender.compare(inside)
         seconds += time.perf_counter() - begin
         if len(left) > 2:
-            left = [left[0], *_ranked(left[1:])[: len(left[1:]) // 2]]  # the one that stands is compared to the end
+            others = sorted(left[1:], key=lambda c: float(c.errors.mean()))
+            left = [left[0], *others[: len(others) // 2]]  # the one that stands is compared to the end
     for contender in contenders:
         contender.end()
     standing, other = left
     mean, error = gain(other.errors, standing.errors)
-    if mean > (0 if other.choice in simpler and math.isfinite(error) else error):
-        return Result(other, mean, error, seconds)
-    return Result(standing, -mean, error, seconds)
+    return Result(other, mean, error, seconds) if mean > error else Result(standing, -mean, error, seconds)
