@@ -8,6 +8,7 @@ import torch
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import ConfigCompositionException
 from hydra_app import build, resolved
 from omegaconf import DictConfig, OmegaConf, open_dict
 
@@ -62,10 +63,22 @@ def as_decided(config: DictConfig, folder: Path) -> DictConfig:
 
 
 def composed(parts: Mapping[str, Part], choices: Mapping[str, str], task: Sequence[str]) -> DictConfig:
-    """The config of a training run with some choices, as overrides have it otherwise; without the plan."""
+    """The config of a training run with some choices, as overrides have it otherwise; without the plan.
+
+    Raises:
+        ValueError: for a choice that sets what this model does not have.
+    """
     chosen = [override for name, part in parts.items() for override in part.candidates[choices[name]]]
     mine = {_key(override) for override in task}
-    config = compose("train", [*(x for x in chosen if _key(x) not in mine), *task])
+    kept = [override for override in chosen if _key(override) not in mine]
+    try:
+        config = compose("train", [*kept, *task])
+    except ConfigCompositionException as error:
+        defaults = " ".join(
+            f"plan.{name}={part.default}" for name, part in parts.items() if part.candidates[choices[name]]
+        )
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise ValueError(f"the plan does not fit this model ({reason}); leave out what it lacks: {defaults}") from error
     with open_dict(config):
         config.pop("plan", None)
     return config

@@ -109,6 +109,7 @@ WRONG = [
     ("train", ("scene=nosuch",), "scene/nosuch"),
     ("train", ("trainer.nosuch=1",), "nosuch"),
     ("train", ("experiment=auto", "plan.motion=2", *TINY[:4]), "plan.motion must be one of still, moves"),
+    ("train", ("experiment=auto", "field=nerf", *TINY[:4]), "leave out what it lacks: plan.detail=fine"),
     ("train", ("+trainer.nosuch=1", *TINY[:4], "out_dir=fresh"), "trainer.nosuch is none of Trainer's arguments"),
     ("train", ("+trainer.losses.x={_target_: no.such.Loss}", *TINY[:4]), "trainer.losses.x._target_ names nothing"),
     ("train", ("+trainer.losses.x={_target_: os.system}", *TINY[:4]), "trainer.losses.x._target_ must be a class"),
