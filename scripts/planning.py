@@ -8,7 +8,6 @@ import torch
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import ConfigCompositionException
 from hydra_app import build, resolved
 from omegaconf import DictConfig, OmegaConf, open_dict
 
@@ -31,7 +30,7 @@ def parts_of(config: DictConfig) -> dict[str, Part]:
 
 
 def given_choices(config: DictConfig, parts: Mapping[str, Part], frames: Frames, folder: Path) -> dict[str, str]:
-    """What is decided already: by the command line, or by a saved plan.
+    """What is decided already: by the command line, by a saved plan, or since the model lacks what a part would set.
 
     Raises:
         ValueError: for a part or a candidate that there is not, or a plan of another data set.
@@ -41,7 +40,10 @@ def given_choices(config: DictConfig, parts: Mapping[str, Part], frames: Frames,
     said = given_overrides(folder)
     for name, part in parts.items():  # what the command line says of one stands
         first = {overrides[0]: choice for choice, overrides in part.candidates.items() if overrides}
-        if name not in choices and {_key(override) for override in first} & {_key(override) for override in said}:
+        is_said = {_key(override) for override in first} & {_key(override) for override in said}
+        every = (override for overrides in part.candidates.values() for override in overrides)
+        fits = all(_has(config, _key(override)) for override in every if override[0] not in "+~")
+        if name not in choices and (is_said or not fits):
             choices[name] = next((first[override] for override in said if override in first), part.default)
     return choices
 
@@ -63,22 +65,10 @@ def as_decided(config: DictConfig, folder: Path) -> DictConfig:
 
 
 def composed(parts: Mapping[str, Part], choices: Mapping[str, str], task: Sequence[str]) -> DictConfig:
-    """The config of a training run with some choices, as overrides have it otherwise; without the plan.
-
-    Raises:
-        ValueError: for a choice that sets what this model does not have.
-    """
+    """The config of a training run with some choices, as overrides have it otherwise; without the plan."""
     chosen = [override for name, part in parts.items() for override in part.candidates[choices[name]]]
     mine = {_key(override) for override in task}
-    kept = [override for override in chosen if _key(override) not in mine]
-    try:
-        config = compose("train", [*kept, *task])
-    except ConfigCompositionException as error:
-        defaults = " ".join(
-            f"plan.{name}={part.default}" for name, part in parts.items() if part.candidates[choices[name]]
-        )
-        reason = str(error.__cause__ or error).splitlines()[0]
-        raise ValueError(f"the plan does not fit this model ({reason}); leave out what it lacks: {defaults}") from error
+    config = compose("train", [*(x for x in chosen if _key(x) not in mine), *task])
     with open_dict(config):
         config.pop("plan", None)
     return config
@@ -108,6 +98,12 @@ def decide(
     callbacks = {name: build(node, trusted=True) for name, node in watching.items() if node is not None}
     box = torch.tensor(config.box)
     return make_plan(parts, given, make, frames, box, seed=config.seed, share=config.plan.share, callbacks=callbacks)
+
+
+def _has(config: DictConfig, key: str) -> bool:
+    parent, _, leaf = key.replace("/", ".").rpartition(".")
+    node = OmegaConf.select(config, parent) if parent else config
+    return node is not None and leaf in node
 
 
 def _key(override: str) -> str:

@@ -6,6 +6,8 @@ import imageio.v3 as iio
 import pytest
 from launcher import run_script
 
+from dnerf.planning.plan import load_plan
+
 TINY = (
     "data.resolution=24",
     "data.num_train=4",
@@ -98,6 +100,15 @@ def test_multirun_gives_each_job_its_folder(tmp_path):
     assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 2
 
 
+def test_parts_about_what_a_model_lacks_are_left_as_they_are(tmp_path):
+    lacking = ("field=nerf", "~trainer.losses.appearance_constancy")  # without levels, waves of time or harmonics
+    done = run_script("train", "experiment=auto", *TINY, *lacking, "out_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    plan = load_plan(tmp_path / "run" / "plan.yaml").decisions
+    given = {name: decision.choice for name, decision in plan.items() if decision.by == "given"}
+    assert given == {"detail": "fine", "colors": "many", "view_dependence": "matte", "appearance": "varying"}
+
+
 def test_cfg_job_prints_the_config(tmp_path):
     done = run_script("train", "--cfg", "job", "experiment=dnerf", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -109,7 +120,6 @@ WRONG = [
     ("train", ("scene=nosuch",), "scene/nosuch"),
     ("train", ("trainer.nosuch=1",), "nosuch"),
     ("train", ("experiment=auto", "plan.motion=2", *TINY[:4]), "plan.motion must be one of still, moves"),
-    ("train", ("experiment=auto", "field=nerf", *TINY[:4]), "leave out what it lacks: plan.detail=fine"),
     ("train", ("+trainer.nosuch=1", *TINY[:4], "out_dir=fresh"), "trainer.nosuch is none of Trainer's arguments"),
     ("train", ("+trainer.losses.x={_target_: no.such.Loss}", *TINY[:4]), "trainer.losses.x._target_ names nothing"),
     ("train", ("+trainer.losses.x={_target_: os.system}", *TINY[:4]), "trainer.losses.x._target_ must be a class"),
