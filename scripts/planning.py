@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dnerf.data.frames import Frames
 from dnerf.planning import Part, Plan, make_plan
-from dnerf.planning.plan import FILE, fingerprint, load_plan, settled
+from dnerf.planning.plan import AS_SET, FILE, fingerprint, load_plan, settled
 from dnerf.rendering.renderer import Renderer
 from dnerf.training.run import Run
 from dnerf.training.trainer import Trainer
@@ -46,6 +46,12 @@ def given_choices(config: DictConfig, parts: Mapping[str, Part], frames: Frames,
         if name not in choices and (is_said or not fits):
             choices[name] = next((first[override] for override in said if override in first), part.default)
     return choices
+
+
+def contradictions(settings: DictConfig, plan: Plan) -> list[str]:
+    """What speaks against choices that a person made in the settings of a plan, a line each."""
+    said = {name: d for name, d in plan.decisions.items() if settings.file or settings.get(name) is not None}
+    return [f"plan.{name}={d.choice} stands {d.why}" for name, d in said.items() if d.by == "given" and d.why != AS_SET]
 
 
 def given_overrides(folder: Path) -> list[str]:

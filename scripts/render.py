@@ -16,7 +16,7 @@ from dnerf.core.checks import check_choice
 from dnerf.data import SceneRecord, SyntheticData, render_exact
 from dnerf.motion import motion_model
 from dnerf.rendering.renderer import Renderer
-from dnerf.samplers import OccupancySampler
+from dnerf.samplers import OccupancySampler, SphereTracingSampler
 from dnerf.visualization import (
     FILM_FORMATS,
     FrameStore,
@@ -43,6 +43,9 @@ def main(config: DictConfig) -> None:
     device = resolve_device(config.device)
     renderer = load_renderer(config.run, saved, device)
     _subdivide(renderer, config.subdivision)
+    if config.surface:
+        traced = SphereTracingSampler(scene.world.box)
+        renderer = Renderer(renderer.field, traced, renderer.background).to(device).eval()
     views = film_views(config, scene, device)
     truth = None
     if "compare" in outputs:
@@ -51,7 +54,7 @@ def main(config: DictConfig) -> None:
     chunk = config.chunk or saved.chunk
     facts = {
         "model": _fingerprint(config.run), "outputs": outputs, "chunk": chunk, "device": device.type,
-        "subdivision": config.subdivision, "world": asdict(scene.world.similarity),
+        "subdivision": config.subdivision, "surface": config.surface, "world": asdict(scene.world.similarity),
     }  # fmt: skip
     path = _output(config, formats)
     store = FrameStore(path.parent / f".{path.name}.{sequence_digest(views, facts)}", len(views))

@@ -83,7 +83,7 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
         ),
         "time": _either("sweep, pingpong, a number or null", TEXT, NUMBER.or_null()),
         "time_range": _listed(NUMBER, "two times", 2).or_null(), "clock": _one_of("run", "data"),
-        "subdivision": POSITIVE.or_null(),
+        "subdivision": POSITIVE.or_null(), "surface": TRUTH,
         "path.split": SPLIT, "path.frame": COUNT.or_null(), "path.radius": NUMBER.or_null(),
         "path.elevation": NUMBER.or_null(), "path.azimuth": NUMBER.or_null(), "path.turns": NUMBER.or_null(),
         "path.start_angle": NUMBER.or_null(), "path.target": PLACE.or_null(),

@@ -46,7 +46,7 @@ def train(config: DictConfig, resume: bool, device: torch.device) -> None:
     parts = planning.parts_of(config)
     given = planning.given_choices(config, parts, frames, folder_of(config)) if parts else {}
     with opened(config) as folder:
-        plan, begun = None, None
+        plan, begun, settings = None, None, config.get("plan")
         if parts:
             plan, begun = planning.decide(config, parts, given, frames, device, folder)
             config = planning.as_planned(config, parts, plan.choices, folder)
@@ -60,6 +60,8 @@ def train(config: DictConfig, resume: bool, device: torch.device) -> None:
             plan.save(folder / FILE)
             save_config(folder, config)
             print(plan.table())
+            for line in planning.contradictions(settings, plan):
+                print(f"warning: {line}")
         sizes = {f"{each.width} x {each.height}" for each in frames.intrinsics}
         size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
         num_parameters = sum(p.numel() for p in renderer.parameters())

@@ -133,17 +133,12 @@ PLAIN = Lens()
 
 
 def blender(
-    top: dict[str, Any] | None = None,
-    each: Callable[[str, int, Lens], dict[str, Any]] = lambda *_: {},
-    *,
-    lens: Callable[[int], Lens] = lambda _: PLAIN,
-    save: Callable[[Path, np.ndarray], None] = png,
-    place: Callable[[np.ndarray], np.ndarray] = lambda pose: pose,
-    moment: float | None = None,
+    top: dict[str, Any] | None = None, each: Callable[[str, int, Lens], dict[str, Any]] = lambda *_: {}, *,
+    lens: Callable[[int], Lens] = lambda _: PLAIN, save: Callable[[Path, np.ndarray], None] = png,
+    place: Callable[[np.ndarray], np.ndarray] = lambda pose: pose, moment: float | None = None,
     times: tuple[float, ...] = tuple(i / (NUM_TRAIN - 1) for i in range(NUM_TRAIN)),
-    test_times: tuple[float, ...] = TEST_TIMES,
-    still: bool = False,
-) -> Maker:
+    test_times: tuple[float, ...] = TEST_TIMES, still: bool = False,
+) -> Maker:  # fmt: skip
     """A maker of a folder in D-NeRF's format.
 
     Args:

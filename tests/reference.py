@@ -43,12 +43,9 @@ class Pixel:
 
 
 def composite_ray(
-    starts: Sequence[float],
-    ends: Sequence[float],
-    densities: Sequence[float],
-    colors: Sequence[Sequence[float]],
+    starts: Sequence[float], ends: Sequence[float], densities: Sequence[float], colors: Sequence[Sequence[float]],
     background: Sequence[float] = (0.0, 0.0, 0.0),
-) -> Pixel:
+) -> Pixel:  # fmt: skip
     """Composite the intervals of one ray, sampled at their middles, front to back."""
     weights = ray_weights([s * (b - a) for a, b, s in zip(starts, ends, densities, strict=True)])
     opacity = math.fsum(weights)
@@ -172,15 +169,10 @@ def rays_towards_origin(num_rays: int, dtype: torch.dtype = torch.float32, seed:
 
 
 def occupancy_sampler(
-    box: Sequence[Sequence[float]],
-    step_size: float = 0.02,
-    resolution: int = 64,
-    *,
-    kind: type[OccupancySampler] = OccupancySampler,
-    coarse_step: float | None = None,
-    coarse_until: float = 0.5,
+    box: Sequence[Sequence[float]], step_size: float = 0.02, resolution: int = 64, *,
+    kind: type[OccupancySampler] = OccupancySampler, coarse_step: float | None = None, coarse_until: float = 0.5,
     **others: Any,
-) -> OccupancySampler:
+) -> OccupancySampler:  # fmt: skip
     """An occupancy sampler of some kind and its grid, from the settings of both.
 
     Training begins with `coarse_step`, if given, and reaches `step_size`, that of images, by equal factors at progress

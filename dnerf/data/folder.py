@@ -21,6 +21,7 @@ from dnerf.data.source import DataSource, NoImages, check_train_end, given_box
 from dnerf.data.splits import TIMES, SplitFrames, split_frames
 
 Z_UP = (0.0, 0.0, 1.0)
+MASKS = ("empty", "ignored")
 PIXELS = 2**20  # looked at together
 
 
@@ -40,24 +41,16 @@ class FolderData(DataSource):
         times: "auto" takes the files', "order" numbers the frames, "static" is one time for all.
         axes: "opengl" or "opencv", of the cameras; "auto" takes the former and refuses cameras that look away.
         pixel_origin: "center", or "corner" as D-NeRF's code; None takes what the file says, "center" if nothing.
+        masks: what lies where a mask is black: "empty" space, or what is "ignored", in training and in scores.
         train_end: train on frames up to this time in [0, 1] only, for extrapolation; None for all.
     """
 
     def __init__(
-        self,
-        root: str | Path,
-        resolution: int | None = None,
-        box: str | Sequence[Sequence[float]] = "auto",
-        *,
-        format: str = "auto",
-        near: float | None = None,
-        far: float | None = None,
-        hold_out: int | None = 8,
-        times: str = "auto",
-        axes: str = "auto",
-        pixel_origin: str | None = None,
+        self, root: str | Path, resolution: int | None = None, box: str | Sequence[Sequence[float]] = "auto", *,
+        format: str = "auto", near: float | None = None, far: float | None = None, hold_out: int | None = 8,
+        times: str = "auto", axes: str = "auto", pixel_origin: str | None = None, masks: str = "empty",
         train_end: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         check_train_end(train_end)
         if not isinstance(root, str | Path):
             raise ValueError(f"root must be a data set's folder, got {root!r}")
@@ -72,10 +65,11 @@ class FolderData(DataSource):
         if pixel_origin is not None:
             check_choice("pixel_origin", pixel_origin, tuple(PIXEL_OFFSETS))
         check_choice("times", times, TIMES)
+        check_choice("masks", masks, MASKS)
         self.root, self.resolution, self.train_end = Path(root), resolution, train_end
         self.given = Given(given_box(box), near, far)
         self.format, self.axes, self.pixel_origin = format, axes, pixel_origin
-        self.hold_out, self.times = hold_out, times
+        self.hold_out, self.times, self.masks = hold_out, times, masks
         self._train: LoadedFrames | None = None
 
     @cached_property
@@ -151,7 +145,7 @@ class FolderData(DataSource):
         return frames
 
     def _load(self, split: str) -> LoadedFrames:
-        loaded = load_frames(self._read_of(split), resolution=self.resolution)
+        loaded = load_frames(self._read_of(split), resolution=self.resolution, masks=self.masks)
         if split == "train" and not _show_something(loaded.images):
             raise ValueError(
                 f"{self.capture.path}: all pixels of the {len(loaded.frames)} training images are alike, they show "
@@ -179,7 +173,7 @@ class FolderData(DataSource):
         background = None if loaded.has_alpha else self.capture.background
         lenses = [self._lens(lens) for lens in loaded.intrinsics]
         names = tuple(frame.name for frame in loaded.frames)
-        return Frames(loaded.images, poses, _times(loaded.frames), lenses, *planes, background, names)
+        return Frames(loaded.images, poses, _times(loaded.frames), lenses, *planes, background, names, loaded.is_known)
 
     def _lens(self, intrinsics: Intrinsics) -> Intrinsics:
         return intrinsics if self.pixel_origin is None else replace(intrinsics, pixel_origin=self.pixel_origin)

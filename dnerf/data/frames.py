@@ -60,20 +60,15 @@ class Frames:
     far: float  # z-depth where rays end
     background: str | Sequence[float] | None  # name or 3 numbers behind opaque images (C = 3); None if unknown
     names: tuple[str, ...]  # F names for messages and files, or none
+    is_known: Tensor | None  # (P,) bool, pixels that count, see `layout`; None for all
     layout: PixelLayout = field(init=False, repr=False)
     _lenses: FrameIntrinsics = field(init=False, repr=False)
 
     def __init__(
-        self,
-        images: Tensor,
-        poses: Tensor,
-        times: Tensor,
-        intrinsics: Intrinsics | Sequence[Intrinsics],
-        near: float = 2.0,
-        far: float = 6.0,
-        background: str | Sequence[float] | None = None,
-        names: tuple[str, ...] = (),
-    ) -> None:
+        self, images: Tensor, poses: Tensor, times: Tensor, intrinsics: Intrinsics | Sequence[Intrinsics],
+        near: float = 2.0, far: float = 6.0, background: str | Sequence[float] | None = None,
+        names: tuple[str, ...] = (), is_known: Tensor | None = None,
+    ) -> None:  # fmt: skip
         check_shape("times", times, ("F",))
         if not len(times):
             raise ValueError("images must be of at least one frame, got none")
@@ -83,7 +78,7 @@ class Frames:
         lenses = FrameIntrinsics(each, images.device)
         values = {
             "images": images, "poses": poses, "times": times, "intrinsics": lenses.each, "near": near, "far": far,
-            "background": background, "names": names, "_lenses": lenses,
+            "background": background, "names": names, "is_known": is_known, "_lenses": lenses,
             "layout": PixelLayout([(lens.height, lens.width) for lens in lenses.each], images.device),
         }  # fmt: skip
         for name, value in values.items():
@@ -114,6 +109,10 @@ class Frames:
             parse_color(self.background)
         if self.names and len(self.names) != num_frames:
             raise ValueError(f"names must be {num_frames} or none, got {len(self.names)}")
+        if self.is_known is not None:
+            check_shape("is_known", self.is_known, (self.num_pixels,))
+            if not bool(self.is_known.any()):
+                raise ValueError("is_known must leave pixels that count, got none")
         self.camera(0)  # checks the planes
 
     def __len__(self) -> int:
@@ -185,6 +184,25 @@ class Frames:
         )  # fmt: skip
         return rays, rgba
 
+    def counted(self, indices: Tensor) -> Tensor:
+        """Pixels (B,) int64 of which those that do not count give way to others of the same."""
+        if self.is_known is None:
+            return indices
+        known = self.is_known[indices]
+        first = (~known).byte().argsort(stable=True)  # those that count
+        turns = torch.arange(len(indices), device=indices.device) % known.sum().clamp(min=1)
+        return torch.where(known, indices, indices[first[turns]])
+
+    def compared(self, index: int, prediction: Tensor, truth: Tensor) -> Tensor:
+        """A prediction (H, W, 3) of one frame, with the truth (H, W, 3) where pixels do not count."""
+        if self.is_known is None:
+            return prediction
+        return torch.where(self._known_of(index).view(*truth.shape[:2], 1), prediction, truth)
+
+    def _known_of(self, index: int) -> Tensor:
+        assert self.is_known is not None
+        return self.is_known[self.layout.starts[index] : self.layout.starts[index + 1]]
+
     def subset(self, indices: Sequence[int]) -> "Frames":
         """The frames with the given indices, in that order (a copy); ValueError for none, or one that is not there."""
         if not len(indices) or not all(-len(self) <= i < len(self) for i in indices):
@@ -195,6 +213,7 @@ class Frames:
         return replace(
             self, images=self._images_of(rows), poses=self.poses[chosen], times=self.times[chosen], names=names,
             intrinsics=tuple(self.intrinsics[i] for i in rows),
+            is_known=None if self.is_known is None else torch.cat([self._known_of(i) for i in rows]),
         )  # fmt: skip
 
     def _images_of(self, rows: Sequence[int]) -> Tensor:
@@ -206,4 +225,6 @@ class Frames:
 
     def to(self, device: str | torch.device) -> "Frames":
         """The same frames on another device."""
-        return replace(self, images=self.images.to(device), poses=self.poses.to(device), times=self.times.to(device))
+        known = None if self.is_known is None else self.is_known.to(device)
+        images, poses, times = (x.to(device) for x in (self.images, self.poses, self.times))
+        return replace(self, images=images, poses=poses, times=times, is_known=known)

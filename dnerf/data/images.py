@@ -53,15 +53,9 @@ def check_image(path: Path) -> None:
 
 
 def read_image(
-    path: Path,
-    *,
-    width: int,
-    height: int,
-    channels: int,
-    size: tuple[int, int],
-    mask: Path | None = None,
+    path: Path, *, width: int, height: int, channels: int, size: tuple[int, int], mask: Path | None = None,
     upright: bool = True,
-) -> Bytes:
+) -> Bytes:  # fmt: skip
     """Decode an image, premultiply by alpha, average over pixel areas and round once: (height, width, channels) uint8.
 
     Palettes and grey are expanded to colour, 16 bits rounded to 8.

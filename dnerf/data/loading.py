@@ -19,8 +19,10 @@ from dnerf.data.images import (
     finish_image,
     has_shape,
     is_transparent,
+    premultiplied_area_average,
     read_header,
     read_image,
+    read_mask,
 )
 from dnerf.data.pixel_layout import MAX_MEMORY, empty_images
 from dnerf.data.videos import read_frames, video_size
@@ -29,6 +31,7 @@ DEFAULT_WIDTH = 400  # in pixels, unless told: D-NeRF's protocol
 MISSING = 10  # of so many images, fewer than one may be missing
 NAMED = 8  # images that a note names
 MAX_THREADS = 4
+KEPT = 250  # of 255, from which on a pixel lies outside what a mask ignores: compressed masks are noisy
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,7 @@ class LoadedFrames:
 
     frames: tuple[CaptureFrame, ...]  # with intrinsics at the size of the pixels
     images: Tensor  # see `Frames.images`
+    is_known: Tensor | None  # see `Frames.is_known`
     notes: tuple[str, ...]  # what was repaired, a line each
 
     @property
@@ -70,6 +74,7 @@ def load_frames(
     *,
     resolution: int | None = None,
     has_alpha: bool | None = None,
+    masks: str = "empty",
     max_memory: int = MAX_MEMORY,
 ) -> LoadedFrames:
     """Decode the images of frames, with their masks as alpha, and reduce them to a width.
@@ -83,6 +88,7 @@ def load_frames(
             own, at most 400, if None.
         has_alpha: whether images have an alpha channel. None decides: if there are masks, or any pixel is not opaque,
             whatever the files' headers say. Splits of one data set should agree.
+        masks: what lies where a mask is black: "empty" space, or what is "ignored", see `Frames.is_known`.
         max_memory: bytes of pixels beyond which they lie in a temporary file, see `empty_pixels`.
 
     Raises:
@@ -101,6 +107,10 @@ def load_frames(
             f"{headers[0].image.path}"
         )
     notes += _scaled_notes(headers)
+    is_known = None
+    if masks == "ignored":
+        is_known = _known(headers)
+        headers = [replace(header, frame=replace(header.frame, mask=None)) for header in headers]
     if has_alpha is None:
         masked = any(header.frame.mask is not None for header in headers)
         has_alpha = masked or any(is_transparent(header.image.path) for header in headers if header.may_have_alpha)
@@ -108,7 +118,7 @@ def load_frames(
     images, parts = empty_images(sizes, 4 if has_alpha else 3, max_memory)
     largest = max(header.size[0] * header.size[1] for header in headers)
     in_threads(_tasks(headers, parts), min(MAX_THREADS, max(1, MAX_PIXELS // largest)))
-    return LoadedFrames(tuple(header.frame for header in headers), images, notes)
+    return LoadedFrames(tuple(header.frame for header in headers), images, is_known, notes)
 
 
 def check_frames(frames: Sequence[CaptureFrame], *, resolution: int | None = None) -> None:
@@ -222,6 +232,21 @@ def _fill_from_video(path: Path, wanted: _Wanted) -> None:
         if not wanted:
             return
     raise ValueError(f"{path}: video must have the frame {min(wanted)}, counted from 0, got {number + 1} frames")
+
+
+def _known(headers: Sequence[_Header]) -> Tensor | None:
+    """The pixels (P,) that masks keep whole; None if there is no mask."""
+    if all(header.frame.mask is None for header in headers):
+        return None
+    parts = []
+    for header in headers:
+        width, height = header.frame.intrinsics.width, header.frame.intrinsics.height
+        kept = torch.full((height, width), 255)
+        if header.frame.mask is not None:
+            mask = read_mask(header.frame.mask, header.size)
+            kept = torch.from_numpy(premultiplied_area_average(mask[..., None], width, height)[..., 0])
+        parts.append(kept.flatten() >= KEPT)
+    return torch.cat(parts)
 
 
 def _fill(header: _Header, part: Tensor, read: Callable[..., Bytes]) -> None:

@@ -98,18 +98,10 @@ class SyntheticData(DataSource):
     """
 
     def __init__(
-        self,
-        scene: AnalyticScene,
-        resolution: int = 200,
-        box: str | Sequence[Sequence[float]] = "auto",
-        *,
-        num_train: int = 100,
-        num_val: int = 10,
-        num_test: int = 20,
-        seed: int = 0,
-        background: str | Sequence[float] | None = None,
-        train_end: float | None = None,
-    ) -> None:
+        self, scene: AnalyticScene, resolution: int = 200, box: str | Sequence[Sequence[float]] = "auto", *,
+        num_train: int = 100, num_val: int = 10, num_test: int = 20, seed: int = 0,
+        background: str | Sequence[float] | None = None, train_end: float | None = None,
+    ) -> None:  # fmt: skip
         check_train_end(train_end)
         check_whole("resolution", resolution)
         self.num_frames = {"train": num_train, "val": num_val, "test": num_test}

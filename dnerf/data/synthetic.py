@@ -53,16 +53,10 @@ def render_exact(scene: AnalyticScene, rays: Rays, background: Tensor | None = N
 
 @torch.no_grad()
 def render_frames(
-    scene: AnalyticScene,
-    poses: Tensor,
-    times: Tensor,
-    lens: int | Intrinsics,
-    *,
-    background: Sequence[float] | None = None,
-    gains: Tensor | None = None,
-    planes: tuple[float, float] = (2.0, 6.0),
+    scene: AnalyticScene, poses: Tensor, times: Tensor, lens: int | Intrinsics, *,
+    background: Sequence[float] | None = None, gains: Tensor | None = None, planes: tuple[float, float] = (2.0, 6.0),
     oversampling: int = 1,
-) -> Frames:
+) -> Frames:  # fmt: skip
     """Render exact frames, one ray through each pixel's centre.
 
     Args:

@@ -40,15 +40,10 @@ NOT_MEASURED = "not measured"
 
 
 def write_report_text(
-    *,
-    title: str,
-    metrics: Sequence[Mapping[str, Any]],
-    config: str,
-    films: Sequence[Path] = (),
-    sheets: Sequence[tuple[str, str, Path]] = (),
-    temporal: Mapping[str, Any] | None = None,
+    *, title: str, metrics: Sequence[Mapping[str, Any]], config: str, films: Sequence[Path] = (),
+    sheets: Sequence[tuple[str, str, Path]] = (), temporal: Mapping[str, Any] | None = None,
     plan: Sequence[Sequence[str]] = (),
-) -> str:
+) -> str:  # fmt: skip
     """The page of a run as HTML text.
 
     Everything is inside: films and images as data URIs, curves as SVG. Nothing is loaded from elsewhere, no script

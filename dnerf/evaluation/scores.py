@@ -50,18 +50,13 @@ FrameCallback = Callable[[FrameScore, Tensor, Tensor], None]
 
 
 def evaluate(
-    renderer: Renderer,
-    frames: Frames,
-    split: str = "test",
-    *,
-    chunk: int = 16384,
-    max_frames: int | None = None,
-    on_frame: FrameCallback | None = None,
-    lpips: Callable[[Tensor, Tensor], float] | None = None,
-) -> Evaluation:
+    renderer: Renderer, frames: Frames, split: str = "test", *, chunk: int = 16384, max_frames: int | None = None,
+    on_frame: FrameCallback | None = None, lpips: Callable[[Tensor, Tensor], float] | None = None,
+) -> Evaluation:  # fmt: skip
     """Render frames and compare them with the truth on the renderer's own (evaluation) background.
 
-    Images are compared as floats in [0, 1]: predictions clamped, truths as stored in 8 bits.
+    Images are compared as floats in [0, 1]: predictions clamped, truths as stored in 8 bits. Pixels that do not count
+    are taken as right.
 
     Args:
         max_frames: score at most so many, spread evenly over the split; None scores all.
@@ -80,6 +75,7 @@ def evaluate(
             torch.cuda.synchronize(device)
         seconds.append(time.perf_counter() - begin)
         truth = frames.image(i, background)
+        prediction = frames.compared(i, prediction, truth)
         score = FrameScore(i, frame_time, min(psnr(prediction, truth), MAX_PSNR), ssim(prediction, truth))
         if lpips is not None:
             score = replace(score, lpips=lpips(prediction, truth))

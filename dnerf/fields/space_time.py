@@ -1,5 +1,6 @@
 """Features of places at times: products of three volumes, each over two axes of space and time."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -11,6 +12,9 @@ from dnerf.core.geometry import cubes, in_unit_cube
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.base import HasRoughness
 from dnerf.kernels import GridLevels, grid_encode
+
+MAX_GIB = 16  # of tables, in training
+BYTES = 16  # of each number: itself, its gradient, two moments
 
 
 class SpaceTimeFeatures(nn.Module, ABC):
@@ -34,7 +38,7 @@ class LatticeFeatures(SpaceTimeFeatures, HasRoughness):
         num_features: of a table's level, F.
 
     Raises:
-        ValueError: for a box or sizes out of range, or levels of which one list has more.
+        ValueError: for a box or sizes out of range, levels of which one list has more, or tables beyond 16 GiB.
     """
 
     def __init__(
@@ -54,6 +58,13 @@ class LatticeFeatures(SpaceTimeFeatures, HasRoughness):
         corners = as_box(box)
         cells = [[*cubes(corners, r), t] for r, t in zip(resolutions, time_resolutions)]
         self.axes = tuple(tuple(some) for some in axes)
+        rows = sum(math.prod(level[k] + 1 for k in some) for level in cells for some in self.axes)
+        gib = BYTES * rows * num_features / 2**30
+        if gib > MAX_GIB:
+            raise ValueError(
+                f"resolutions {list(resolutions)}, with {max(time_resolutions)} cells of time, need {gib:.0f} GiB in "
+                f"training, of at most {MAX_GIB}: use coarser ones"
+            )
         self.levels = tuple(
             GridLevels.dense([[*(level[k] for k in some), 0][:3] for level in cells]) for some in self.axes
         )

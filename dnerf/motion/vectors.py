@@ -35,17 +35,9 @@ class MotionVectors:
 
 @torch.no_grad()
 def motion_vectors(
-    model: MotionModel | None,
-    camera: Camera,
-    time: float,
-    other_time: float,
-    depth: Tensor,
-    opacity: Tensor,
-    *,
-    other_camera: Camera | None = None,
-    other_depth: Tensor | None = None,
-    chunk: int = 65536,
-) -> MotionVectors:
+    model: MotionModel | None, camera: Camera, time: float, other_time: float, depth: Tensor, opacity: Tensor, *,
+    other_camera: Camera | None = None, other_depth: Tensor | None = None, chunk: int = 65536,
+) -> MotionVectors:  # fmt: skip
     """Motion of every pixel of an image between two times.
 
     Args:

@@ -23,15 +23,9 @@ class Part:
     """
 
     def __init__(
-        self,
-        question: str,
-        candidates: Mapping[str, Sequence[str]],
-        default: str,
-        *,
-        at: float = 0.1,
-        evidence: Evidence | None = None,
-        only_if: Mapping[str, str] | None = None,
-    ) -> None:
+        self, question: str, candidates: Mapping[str, Sequence[str]], default: str, *, at: float = 0.1,
+        evidence: Evidence | None = None, only_if: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
         if len(candidates) < 2:
             raise ValueError(f"candidates must be at least two, got {list(candidates)}")
         check_choice("default", default, tuple(candidates))

@@ -13,6 +13,7 @@ from dnerf.data.frames import Frames
 from dnerf.planning.parts import Part
 
 FILE = "plan.yaml"
+AS_SET = "as set"  # why a given choice stands, unless something speaks against it
 MAX_BYTES = 64 * 1024
 
 
@@ -95,6 +96,8 @@ def settled(parts: Mapping[str, Part], given: Mapping[str, object], file: Path |
         saved = load_plan(file)
         if saved.data and saved.data != data:
             raise ValueError(f"plan.file: {file} is about another data set; leave it out, or the line data in it")
+        for name in saved.choices.keys() - parts.keys():
+            raise ValueError(f"plan.file: {file}: {name} is none of the parts {', '.join(parts)}")
         given = {**saved.choices, **given}
     for name in given.keys() - parts.keys():
         raise ValueError(f"plan.{name} is none of the parts {', '.join(parts)}")

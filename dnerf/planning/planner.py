@@ -9,7 +9,7 @@ from torch import Tensor
 from dnerf.data.frames import Frames
 from dnerf.planning.evidence import Finding
 from dnerf.planning.parts import Part
-from dnerf.planning.plan import Decision, Plan, fingerprint
+from dnerf.planning.plan import AS_SET, Decision, Plan, fingerprint
 from dnerf.planning.trials import Contender, Effort, HeldOut, Maker, contest, split_frames
 from dnerf.training.callbacks import Callback
 from dnerf.training.run import Run
@@ -20,16 +20,9 @@ MOST_STEPS = 400  # more tell nothing new
 
 
 def make_plan(
-    parts: Mapping[str, Part],
-    given: Mapping[str, str],
-    make: Maker,
-    frames: Frames,
-    box: Tensor,
-    *,
-    seed: int = 0,
-    share: float = 0.1,
-    callbacks: Mapping[str, Callback] | None = None,
-) -> tuple[Plan, Run | None]:
+    parts: Mapping[str, Part], given: Mapping[str, str], make: Maker, frames: Frames, box: Tensor, *, seed: int = 0,
+    share: float = 0.1, callbacks: Mapping[str, Callback] | None = None,
+) -> tuple[Plan, Run | None]:  # fmt: skip
     """Decide every part, and the run that the trials' winner has begun.
 
     Parts are decided one after the other, in the order of when they are tried. Candidates go on from the weights of the
@@ -73,7 +66,7 @@ class _Planner:
         part = self.parts[name]
         begin = time.perf_counter()
         if given is not None:
-            self.decisions[name] = Decision(given, "given", "as set")
+            self.decisions[name] = Decision(given, "given", self._as_set(part, given))
         elif not part.arises(self._choices()):
             self.decisions[name] = Decision(part.simplest, "default", "the question does not arise")
         elif part.evidence is not None and (finding := part.evidence.find(self.frames, self.box)) is not None:
@@ -82,6 +75,14 @@ class _Planner:
                 self.decisions[name] = Decision(finding.choice, "images", finding.why, seconds=seconds)
             else:
                 self.standing[name] = finding
+
+    def _as_set(self, part: Part, given: str) -> str:
+        """Why a given choice stands, with what speaks against it."""
+        if given != part.simplest and not part.arises(self._choices()):
+            needed = ", ".join(f"{name}={choice}" for name, choice in part.only_if.items())
+            return f"{AS_SET}, though the question arises with {needed} only"
+        finding = None if part.evidence is None else part.evidence.find(self.frames, self.box)
+        return AS_SET if finding is None or finding.choice == given else f"{AS_SET}, though {finding.why}"
 
     def _choices(self, **tried: str) -> dict[str, str]:
         """Those made or tried, defaults for all others, the simplest where a question does not arise."""

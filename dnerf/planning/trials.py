@@ -110,7 +110,8 @@ class HeldOut:
         generator = torch.Generator().manual_seed(seed)
         size = frames.num_pixels // len(frames)
         pixels = torch.randint(size, (len(frames), max(1, NUM_RAYS // len(frames))), generator=generator)
-        return cls(frames, pixels + size * torch.arange(len(frames))[:, None])
+        pixels = pixels + size * torch.arange(len(frames))[:, None]
+        return cls(frames, torch.stack([frames.counted(row) for row in pixels.to(frames.images.device)]))
 
     def within(self, times: Tensor) -> "HeldOut":
         """Those frames whose times lie between the first and the last of some; all, if fewer than two do."""

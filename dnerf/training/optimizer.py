@@ -143,17 +143,10 @@ class AdamSettings:
     """
 
     def __init__(
-        self,
-        learning_rates: Mapping[str, float] | None = None,
-        *,
-        weight_decays: Mapping[str, float] | None = None,
-        final_rate: float = 0.1,
-        hold_until: float = 0.0,
-        warmup_steps: int = 0,
-        betas: Sequence[float] = (0.9, 0.999),
-        epsilon: float = 1e-8,
-        orthogonal: bool = False,
-    ) -> None:
+        self, learning_rates: Mapping[str, float] | None = None, *, weight_decays: Mapping[str, float] | None = None,
+        final_rate: float = 0.1, hold_until: float = 0.0, warmup_steps: int = 0, betas: Sequence[float] = (0.9, 0.999),
+        epsilon: float = 1e-8, orthogonal: bool = False,
+    ) -> None:  # fmt: skip
         self.learning_rates = {DEFAULT: 5e-4} if learning_rates is None else learning_rates
         check_mapping("learning_rates", self.learning_rates, allow_zero=True)
         self.weight_decays = {} if weight_decays is None else weight_decays

@@ -63,22 +63,12 @@ class Trainer:
     """
 
     def __init__(
-        self,
-        *,
-        num_steps: int = 200_000,
-        max_seconds: float | None = None,
-        num_rays: int = 1024,
-        target_samples: int | None = None,
-        max_rays: int = 1 << 16,
-        losses: Mapping[str, Loss] | None = None,
-        pixels: PixelSampler | None = None,
-        optimizer: AdamSettings | None = None,
-        callbacks: Mapping[str, Callback] | None = None,
-        log_every: int = 20,
-        graphs: bool = False,
-        marched_per_sample: float = 3.0,
-        opening_steps: int | None = None,
-    ) -> None:
+        self, *, num_steps: int = 200_000, max_seconds: float | None = None, num_rays: int = 1024,
+        target_samples: int | None = None, max_rays: int = 1 << 16, losses: Mapping[str, Loss] | None = None,
+        pixels: PixelSampler | None = None, optimizer: AdamSettings | None = None,
+        callbacks: Mapping[str, Callback] | None = None, log_every: int = 20, graphs: bool = False,
+        marched_per_sample: float = 3.0, opening_steps: int | None = None,
+    ) -> None:  # fmt: skip
         target = 1 if target_samples is None else target_samples
         for name, value in (("num_rays", num_rays), ("max_rays", max_rays), ("target_samples", target)):
             check_whole(name, value)
@@ -98,15 +88,9 @@ class Trainer:
         self._losses_at_first = copy.deepcopy(self.losses.state_dict())
 
     def fit(
-        self,
-        renderer: Renderer,
-        frames: Frames,
-        *,
-        seed: int = 0,
-        folder: str | Path | None = None,
-        resume: bool = False,
-        begun: Run | None = None,
-    ) -> TrainingRecord:
+        self, renderer: Renderer, frames: Frames, *, seed: int = 0, folder: str | Path | None = None,
+        resume: bool = False, begun: Run | None = None,
+    ) -> TrainingRecord:  # fmt: skip
         """Train in place; the last step's record.
 
         With a folder, SIGTERM and SIGINT end training after the step they find, and after what callbacks then do.
@@ -209,9 +193,10 @@ class Trainer:
         factor = self.optimizer.factor(run.step, run.progress)
         run.optimizer.set_rates(factor * run.rate_factor)
         stepper.update()
-        indices = self.pixels.draw(num_rays, run.progress, run.generator)
+        drawn = self.pixels.draw(num_rays, run.progress, run.generator)
+        indices = run.frames.counted(drawn)
         result = stepper(indices)
-        self.pixels.feedback(indices, result.errors)
+        self.pixels.feedback(drawn, torch.where(indices == drawn, result.errors, 0))  # what does not count is right
         if run.renderer.device.type == "cuda" and self.limits.is_recorded(run.step + 1):
             torch.cuda.synchronize(run.renderer.device)  # looking stops the clock, not what is still at work
         run.seconds += time.perf_counter() - begin

@@ -25,16 +25,9 @@ MIN_VISIBLE = 1 / 255  # Opacity below which an image in 8 bits shows nothing
 
 
 def render_frames_to(
-    store: FrameStore,
-    renderer: Renderer,
-    views: Sequence[View],
-    outputs: Sequence[str],
-    *,
-    truth: Truth | None = None,
-    chunk: int = 16384,
-    on_frame: Callable[[int], None] | None = None,
-    unit: float = 1.0,
-) -> int:
+    store: FrameStore, renderer: Renderer, views: Sequence[View], outputs: Sequence[str], *, truth: Truth | None = None,
+    chunk: int = 16384, on_frame: Callable[[int], None] | None = None, unit: float = 1.0,
+) -> int:  # fmt: skip
     """Render the frames that the store lacks, each written while the next one is rendered; returns how many.
 
     Args:
@@ -70,15 +63,9 @@ def render_frames_to(
 
 
 def write_films(
-    store: FrameStore,
-    path: Path,
-    outputs: Sequence[str],
-    formats: Sequence[str],
-    *,
-    fps: float = 30.0,
-    views: Sequence[View] = (),
-    world: World | None = None,
-) -> list[Path]:
+    store: FrameStore, path: Path, outputs: Sequence[str], formats: Sequence[str], *, fps: float = 30.0,
+    views: Sequence[View] = (), world: World | None = None,
+) -> list[Path]:  # fmt: skip
     """Make the finished files of a complete store; returns their paths.
 
     The output "rgb" (or the only one) gets the path itself with the format's suffix, others `<path>_<output>`; raw

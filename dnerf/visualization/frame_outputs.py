@@ -43,15 +43,9 @@ def check_outputs(outputs: Sequence[str]) -> None:
 
 @torch.no_grad()
 def render_layers(
-    renderer: Renderer,
-    view: View,
-    following: View | None,
-    outputs: Sequence[str],
-    *,
-    truth: Truth | None = None,
-    chunk: int = 16384,
-    unit: float = 1.0,
-) -> dict[str, NDArray]:
+    renderer: Renderer, view: View, following: View | None, outputs: Sequence[str], *, truth: Truth | None = None,
+    chunk: int = 16384, unit: float = 1.0,
+) -> dict[str, NDArray]:  # fmt: skip
     """Render one frame.
 
     Args:

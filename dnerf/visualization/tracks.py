@@ -92,17 +92,9 @@ def track_colors(points: Tensor) -> list[tuple[int, int, int]]:
 
 
 def render_tracks(
-    renderer: Renderer,
-    camera: Camera,
-    points: Tensor,
-    time: float,
-    times: Sequence[float],
-    *,
-    trail: int = 12,
-    every: int = 1,
-    tolerance: float = 0.08,
-    chunk: int = 16384,
-) -> tuple[Tracks, Iterator[Tensor]]:
+    renderer: Renderer, camera: Camera, points: Tensor, time: float, times: Sequence[float], *, trail: int = 12,
+    every: int = 1, tolerance: float = 0.08, chunk: int = 16384,
+) -> tuple[Tracks, Iterator[Tensor]]:  # fmt: skip
     """Follow points and draw them over images (H, W, 3) uint8 of a film, each rendered when it is taken.
 
     Args:

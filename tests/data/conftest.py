@@ -27,14 +27,9 @@ def make_scene(tmp_path: Path) -> Scene:
     """Write a scene: `make_scene(edit)` lets a test spoil the JSON, and images are `random_rgba`."""
 
     def make(
-        edit: Callable[[dict[str, Any]], object] = lambda manifest: None,
-        *,
-        num_frames: int = 3,
-        height: int = 6,
-        width: int = 8,
-        split: str = "train",
-        mode: str = "RGBA",
-    ) -> Path:
+        edit: Callable[[dict[str, Any]], object] = lambda manifest: None, *, num_frames: int = 3, height: int = 6,
+        width: int = 8, split: str = "train", mode: str = "RGBA",
+    ) -> Path:  # fmt: skip
         root = tmp_path / "scene"
         (root / split).mkdir(parents=True)
         manifest: dict[str, Any] = {"camera_angle_x": 0.7, "frames": []}

@@ -41,6 +41,25 @@ def test_image_is_premultiplied_colour_plus_what_alpha_lets_through() -> None:
     assert image.max() <= 1 + 1e-6
 
 
+def test_pixels_that_do_not_count_give_way_to_others_and_count_as_right() -> None:
+    known = torch.arange(60) % 3 != 1
+    frames = make_frames(is_known=known)
+    drawn = torch.randint(60, (200,), generator=torch.Generator().manual_seed(0))
+    counted = frames.counted(drawn)
+    assert bool(known[counted].all())
+    assert torch.equal(counted[known[drawn]], drawn[known[drawn]])
+    assert set(counted.tolist()) <= set(drawn.tolist())
+    assert torch.equal(make_frames().counted(drawn), drawn)
+    zeros, ones = torch.zeros(4, 5, 3), torch.ones(4, 5, 3)
+    for part, indices in ((frames, (0, 1, 2)), (frames.subset([2, 0]).to("cpu"), (2, 0))):
+        for i, index in enumerate(indices):
+            shown = part.compared(i, zeros, ones)
+            assert torch.equal(shown[..., 0] == 0, known[20 * index : 20 * index + 20].view(4, 5))
+    for wrong in (known[:-1], torch.zeros(60, dtype=torch.bool)):
+        with pytest.raises(ValueError, match="is_known must"):
+            make_frames(is_known=wrong)
+
+
 def test_composite_on_is_exact_where_alpha_is_zero_or_one_and_takes_a_background_per_pixel() -> None:
     rgba = torch.tensor([[0.0, 0, 0, 0], [0.2, 0.4, 0.6, 1]])
     out = composite_on(rgba, torch.tensor([1.0, 0.5, 0.0]))
@@ -197,8 +216,7 @@ def test_pixels_of_no_index_are_no_rays_and_there_are_so_many() -> None:
 
 
 @pytest.mark.parametrize(
-    ("indices", "error"),
-    [([60], IndexError), ([-1], IndexError), ([[0], [0]], ValueError), ([0.0, 0.0], ValueError)],
+    ("indices", "error"), [([60], IndexError), ([-1], IndexError), ([[0], [0]], ValueError), ([0.0, 0.0], ValueError)]
 )
 def test_pixels_beyond_the_last_and_other_than_a_row_of_int64_are_refused(indices: list, error: type) -> None:
     with pytest.raises(error, match="ind"):

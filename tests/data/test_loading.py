@@ -153,6 +153,23 @@ def test_masks_and_transparent_pixels_make_alpha_and_opaque_channels_none(tmp_pa
         load_frames([replace(one, mask=tmp_path / "none.png")])
 
 
+def test_ignored_pixels_are_those_that_a_mask_does_not_keep_whole_and_images_stay_opaque(tmp_path: Path) -> None:
+    one, other = frame(tmp_path / "a.png", random_pixels(0)), frame(tmp_path / "b.png", random_pixels(1))
+    levels = np.full((6, 8), 255, np.uint8)
+    levels[1, 2], levels[5, 6] = 0, 254
+    Image.fromarray(levels).save(tmp_path / "mask.png")
+    masked = replace(one, mask=tmp_path / "mask.png")
+    loaded = load_frames([masked, other], masks="ignored")
+    assert not loaded.has_alpha
+    assert torch.equal(loaded.images, load_frames([one, other]).images)
+    assert loaded.is_known is not None
+    assert (~loaded.is_known).nonzero().tolist() == [[8 * 1 + 2]]
+    halved = load_frames([masked, other], resolution=4, masks="ignored").is_known
+    assert halved is not None
+    assert (~halved).nonzero().tolist() == [[1]]
+    assert load_frames([one, other], masks="ignored").is_known is None
+
+
 def test_frames_of_videos_are_theirs_in_any_order_beside_images(tmp_path: Path) -> None:
     pixels = [random_pixels(i, 16, 18) for i in range(7)]
     path = write_video(tmp_path / "a b.mkv", pixels, (18, 16))

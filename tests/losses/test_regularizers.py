@@ -13,14 +13,7 @@ from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.rays import Samples
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
 from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes, VoxelField
-from dnerf.losses import (
-    Batch,
-    DistortionLoss,
-    PhotometricLoss,
-    SmoothnessLoss,
-    TimeEmbeddingLoss,
-    UnseenSpaceLoss,
-)
+from dnerf.losses import Batch, DistortionLoss, PhotometricLoss, SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
 

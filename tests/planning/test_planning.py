@@ -16,14 +16,8 @@ from dnerf.core.cameras import Intrinsics, look_at
 from dnerf.data import Frames, SyntheticData
 from dnerf.fields import GridField
 from dnerf.planning import Decision, Evidence, Finding, Part, Plan, make_plan
-from dnerf.planning.evidence import (
-    ColorsEvidence,
-    DetailEvidence,
-    MotionEvidence,
-    SurroundingsEvidence,
-    mixture_share,
-)
-from dnerf.planning.plan import fingerprint, load_plan
+from dnerf.planning.evidence import ColorsEvidence, DetailEvidence, MotionEvidence, SurroundingsEvidence, mixture_share
+from dnerf.planning.plan import fingerprint, load_plan, settled
 from dnerf.planning.planner import LEAST_STEPS
 from dnerf.planning.trials import Contender, Effort, HeldOut, contest, gain, split_frames
 from dnerf.rendering import Renderer
@@ -277,6 +271,31 @@ def test_broken_plans_are_refused_naming_the_file(tmp_path: Path, text: str) -> 
     (tmp_path / "plan.yaml").write_text(text)
     with pytest.raises(ValueError, match=r"plan\.file: .*plan\.yaml"):
         load_plan(tmp_path / "plan.yaml")
+
+
+def test_what_speaks_against_a_given_choice_is_said() -> None:
+    class Sees(Evidence):
+        def find(self, frames: Frames, box: torch.Tensor) -> Finding:
+            return Finding("slow", "nothing is quick")
+
+    parts = {"rate": part(evidence=Sees()), "more": Part("", CANDIDATES, "slow", at=0.2, only_if={"rate": "slow"})}
+    plan, _ = make_plan(parts, {"rate": "quick", "more": "quick"}, make, small_frames(6), BOX)
+    assert plan.decisions["rate"].why == "as set, though nothing is quick"
+    assert plan.decisions["more"].why == "as set, though the question arises with rate=slow only"
+    plan, _ = make_plan(parts, {"rate": "slow", "more": "quick"}, make, small_frames(6), BOX)
+    assert [decision.why for decision in plan.decisions.values()] == ["as set", "as set"]
+
+
+def test_plans_with_unknown_parts_or_about_other_data_are_refused(tmp_path: Path) -> None:
+    file, parts, data = tmp_path / "plan.yaml", {"rate": part()}, fingerprint(small_frames())
+    Plan({"rate": Decision("quick", "trial", "")}, data).save(file)
+    assert settled(parts, {}, file, data) == {"rate": "quick"}
+    with pytest.raises(ValueError, match=r"plan\.yaml is about another data set"):
+        settled(parts, {}, file, fingerprint(small_frames(5)))
+    with pytest.raises(ValueError, match=r"plan\.yaml: rate is none of the parts other"):
+        settled({"other": part()}, {}, file, data)
+    with pytest.raises(ValueError, match=r"^plan\.speed is none of the parts rate"):
+        settled(parts, {"speed": True}, None, data)
 
 
 def test_part_names_its_candidates() -> None:

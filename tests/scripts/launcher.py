@@ -14,6 +14,12 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+DEMO = (
+    "experiment=demo data.resolution=16 data.num_train=3 data.num_val=1 data.num_test=1 trainer.max_seconds=null "
+    "trainer.num_rays=32 trainer.target_samples=1024 trainer.log_every=1 ~trainer.callbacks.progress_bar "
+    "field.resolutions=[8,16] sampler.grid.resolution=16 sampler.grid.num_slabs=4 +sampler.grid.num_probes=1024"
+)
+SMALL_DEMO = tuple(DEMO.split())
 
 
 class Run:
@@ -30,13 +36,9 @@ class Run:
     _server: subprocess.Popen[str] | None = None
 
     def __init__(
-        self,
-        name: str,
-        *arguments: object,
-        cwd: Path,
-        user: int | None = None,
+        self, name: str, *arguments: object, cwd: Path, user: int | None = None,
         environment: Mapping[str, str] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._folder = tempfile.TemporaryDirectory()
         Path(self._folder.name).chmod(0o777)
         request = {

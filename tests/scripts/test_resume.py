@@ -9,27 +9,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from launcher import Run, run_script
+from launcher import SMALL_DEMO, Run, run_script
 
 from dnerf.training.tensor_files import decode
 
-SETTINGS = (
-    "experiment=demo",
-    "data.resolution=16",
-    "data.num_train=3",
-    "data.num_val=1",
-    "data.num_test=1",
-    "trainer.max_seconds=null",
-    "trainer.num_rays=32",
-    "trainer.target_samples=1024",
-    "trainer.log_every=1",
-    "trainer.callbacks.checkpoints.every=8",
-    "~trainer.callbacks.progress_bar",
-    "field.resolutions=[8,16]",
-    "sampler.grid.resolution=16",
-    "sampler.grid.num_slabs=4",
-    "+sampler.grid.num_probes=1024",
-)
+SETTINGS = (*SMALL_DEMO, "trainer.callbacks.checkpoints.every=8")
 STEPS = 24
 
 

@@ -207,14 +207,7 @@ def test_consistency_is_checked_and_written(work, capsys, monkeypatch):
 
 
 def test_truth_stands_beside_the_prediction(work):
-    call(
-        "render",
-        "run=run",
-        "path=test",
-        "format=png",
-        "outputs=[compare]",
-        "output=compare/film",
-    )
+    call("render", "run=run", "path=test", "format=png", "outputs=[compare]", "output=compare/film")
     assert len(list((work / "compare" / "film").glob("*.png"))) == 2
 
 
@@ -298,6 +291,7 @@ def test_report_is_made_from_what_lies_in_the_run(work):
 
 WRONG = [
     ("render", ("run=run", "keep_frames=maybe"), "keep_frames must be true or false, got 'maybe'"),
+    ("render", ("run=run", "surface=true"), "sphere tracing needs a field with a signed distance"),
     ("render", ("run=run", "subdivision=0"), "subdivision must be a whole number of at least 1 or null, got 0"),
     ("render", ("run=run", "subdivision=1.5"), "subdivision must be a whole number of at least 1 or null, got 1.5"),
     ("render", ("run=run", "path.split=all"), "path.split must be one of train, val, test or null, got 'all'"),

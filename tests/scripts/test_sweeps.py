@@ -8,28 +8,11 @@ from pathlib import Path
 
 import pytest
 import sweeps
-from launcher import Run, run_script
+from launcher import SMALL_DEMO, Run, run_script
 
 pytestmark = pytest.mark.slow
 
-SETTINGS = (
-    "experiment=demo",
-    "data.resolution=16",
-    "data.num_train=3",
-    "data.num_val=1",
-    "data.num_test=1",
-    "trainer.max_seconds=null",
-    "trainer.num_rays=32",
-    "trainer.target_samples=1024",
-    "trainer.log_every=1",
-    "trainer.callbacks.checkpoints.every=5",
-    "~trainer.callbacks.progress_bar",
-    "field.resolutions=[8,16]",
-    "sampler.grid.resolution=16",
-    "sampler.grid.num_slabs=4",
-    "+sampler.grid.num_probes=1024",
-    "out_dir=sweep",
-)
+SETTINGS = (*SMALL_DEMO, "trainer.callbacks.checkpoints.every=5", "out_dir=sweep")
 
 
 def sweep(cwd: Path, *changes: str):
@@ -175,12 +158,7 @@ def test_a_killed_worker_of_joblib_ends_the_sweep_with_an_error_and_nothing_lost
 @pytest.mark.slow
 def test_submitit_runs_each_job_in_its_own_process(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    arguments = (
-        "hydra/launcher=submitit_local",
-        "hydra.launcher.timeout_min=5",
-        "seed=0,1",
-        "field.window_end=2,0.5",
-    )
+    arguments = ("hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5", "seed=0,1", "field.window_end=2,0.5")
     done = sweep(tmp_path, *arguments)
     assert done.returncode == 2, done.stderr
     found = {row["run"]: row["status"] for row in rows(tmp_path / "sweep")}

@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partialmethod
 from itertools import pairwise
 from pathlib import Path
@@ -339,3 +340,17 @@ def test_nothing_is_said_of_the_box_where_the_background_shows_what_lies_beyond(
     renderer = small_renderer(sampler=OccupancySampler(OccupancyGrid(inside, 8), 0.05), background=beyond)
     trainer(callbacks={"box": BoxWarning(least_steps=20)}).fit(renderer, frames)
     assert "geometry reaches the box" not in caplog.text
+
+
+def test_nothing_is_learnt_from_pixels_that_do_not_count(frames: Frames) -> None:
+    """Whatever they hold, the weights are the same; no block of them is drawn as unknown for ever."""
+    known = torch.arange(frames.num_pixels) % 24 > 5
+    found = []
+    for value in (0, 200):
+        images = frames.images.clone()
+        images.view(-1, 4)[~known] = value
+        model, pixels = small_renderer(), ErrorGuidedPixels(UniformPixels(), 0.5, resolution=12)
+        trainer(pixels=pixels).fit(model, replace(frames, images=images, is_known=known))
+        found.append(weights(model))
+        assert bool((pixels.errors[:, :, :3] <= 1e-5).any())
+    assert torch.equal(*found)
