@@ -19,7 +19,8 @@ from dnerf.core.files import write_json, write_text
 from dnerf.core.rays import Rays
 from dnerf.data import DataSource, Frames, SceneRecord, SyntheticData, random_views, render_exact
 from dnerf.data.placing import planes_between
-from dnerf.evaluation import FrameScore, check_consistency, evaluate, evaluate_over_time, lpips_metric
+from dnerf.evaluation import FrameScore, check_consistency, error_shares, evaluate, evaluate_over_time, kinds_of
+from dnerf.evaluation.images import lpips_metric
 from dnerf.evaluation.plots import frame_curves
 from dnerf.evaluation.protocols import LEGO, Protocol, csv_table, find_protocol, markdown_table, table_json, table_notes
 from dnerf.evaluation.provenance import provenance
@@ -82,6 +83,8 @@ def _score(config: DictConfig, run: str, protocol: Protocol | None, lpips: Lpips
     )  # fmt: skip
     print_scores(metrics, folder, name)
     _write_worst(folder, renderer, data.frames(split), metrics, config.worst, chunk)
+    if config.kinds:
+        _print_kinds(renderer, data.frames(split), config.max_frames, chunk)
     if config.plots:
         _write_curves(folder / f"curves_{split}.svg", {scene: metrics["frames"]})
     if config.temporal.enabled:
@@ -124,6 +127,22 @@ def _write_worst(
     path = folder / f"worst_frames_{metrics['split']}.png"
     write_png(comparison_sheet(pairs, labels), path)
     print(f"worst frames:  {path}")
+
+
+def _print_kinds(renderer: Renderer, frames: Frames, max_frames: int | None, chunk: int) -> None:
+    """Where the error lies, one line a kind."""
+    if not frames.has_alpha:
+        raise ValueError("kinds: silhouettes are those of images with alpha, these have none")
+    found: list[tuple[Tensor, Tensor]] = []
+
+    def keep(score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
+        alpha = frames.stored_image(score.index)[..., 3].to(truth.device) / 255
+        found.append(((prediction - truth).square().mean(-1), kinds_of(truth, alpha)))
+
+    evaluate(renderer, frames, chunk=chunk, max_frames=max_frames, on_frame=keep)
+    errors, kinds = (torch.cat([x.flatten() for x in part]) for part in zip(*found, strict=True))
+    for name, (share, pixels) in error_shares(errors, kinds).items():
+        print(f"{name:14} {share:.2f} of the squared error, {pixels:.2f} of the pixels")
 
 
 def _write_curves(path: Path, runs: dict[str, Any]) -> None:

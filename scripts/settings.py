@@ -72,8 +72,8 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
     "evaluate": {
         "run": TEXT.or_null(), "runs": TEXTS, "protocol": TEXT.or_null(), "split": SPLIT, "label": TEXT.or_null(),
         "lego_split": _one_of("test", "val").or_null(), "table": TEXT.or_null(), "max_frames": POSITIVE.or_null(),
-        "worst": COUNT, "plots": TRUTH, "consistency": TRUTH, "lpips.enabled": TRUTH, "lpips.download": TRUTH,
-        "temporal.enabled": TRUTH, "temporal.num_frames": _whole(3), "temporal.resolution": POSITIVE,
+        "worst": COUNT, "kinds": TRUTH, "plots": TRUTH, "consistency": TRUTH, "lpips.enabled": TRUTH,
+        "lpips.download": TRUTH, "temporal.enabled": TRUTH, "temporal.num_frames": _whole(3), "temporal.resolution": POSITIVE,
         "chunk": POSITIVE.or_null(),
     },
     "render": {

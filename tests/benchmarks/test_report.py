@@ -48,13 +48,10 @@ def test_report_holds_everything(tmp_path):
     assert (path.parent / "errors.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "–"), (True, "yes"), (3, "3"), (0.0, "0"), (1234.5, "1,234"), (12.345, "12.35"), (1.0, "1"),
-        (0.0123456, "0.0123"), (1.5e-7, "1.50e-07"), (float("nan"), "nan"), ("x", "x"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("value", "text"), [
+    (None, "–"), (True, "yes"), (3, "3"), (0.0, "0"), (1234.5, "1,234"), (12.345, "12.35"), (1.0, "1"),
+    (0.0123456, "0.0123"), (1.5e-7, "1.50e-07"), (float("nan"), "nan"), ("x", "x"),
+])  # fmt: skip
 def test_numbers_are_shown_with_three_or_four_digits(value, text):
     assert show(value) == text
 

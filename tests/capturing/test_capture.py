@@ -175,15 +175,12 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, film: Path, pl
         capture(tmp_path / "other", find_films(film), num_frames=11)
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"num_frames": 2}, "num_frames must be at least 3, got 2"),
-        ({"num_frames": 0}, "num_frames must be"),
-        ({"min_share": 2}, r"min_share must be in \[0, 1\]"),
-        ({"model": Path("sparse")}, "model needs images=folder"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "said"), [
+    ({"num_frames": 2}, "num_frames must be at least 3, got 2"),
+    ({"num_frames": 0}, "num_frames must be"),
+    ({"min_share": 2}, r"min_share must be in \[0, 1\]"),
+    ({"model": Path("sparse")}, "model needs images=folder"),
+])  # fmt: skip
 def test_impossible_settings_are_refused(tmp_path: Path, film: Path, placing, settings, said: str) -> None:
     placing(10)
     with pytest.raises(ValueError, match=said):

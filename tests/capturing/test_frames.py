@@ -124,20 +124,17 @@ def write_wrong(folder: Path) -> None:
         save(folder / "twice" / f"1.{end}", noise(0))
 
 
-@pytest.mark.parametrize(
-    ("sources", "said"),
-    [
-        ({}, "give video=film.mp4"),
-        ({"video": "a", "images": "b"}, "one of them only"),
-        ({"video": "nowhere.mp4"}, "nowhere.mp4 does not exist"),
-        ({"video": "empty.mp4"}, "is empty, of 0 bytes"),
-        ({"video": "text.mp4"}, "cannot be decoded.*ffmpeg -i text.mp4"),
-        ({"video": "nothing"}, "must hold videos"),
-        ({"images": "nothing"}, "must hold PNG or JPEG images.*got 0"),
-        ({"images": "nowhere"}, "must hold PNG or JPEG images"),
-        ({"images": "twice"}, "different names"),
-    ],
-)
+@pytest.mark.parametrize(("sources", "said"), [
+    ({}, "give video=film.mp4"),
+    ({"video": "a", "images": "b"}, "one of them only"),
+    ({"video": "nowhere.mp4"}, "nowhere.mp4 does not exist"),
+    ({"video": "empty.mp4"}, "is empty, of 0 bytes"),
+    ({"video": "text.mp4"}, "cannot be decoded.*ffmpeg -i text.mp4"),
+    ({"video": "nothing"}, "must hold videos"),
+    ({"images": "nothing"}, "must hold PNG or JPEG images.*got 0"),
+    ({"images": "nowhere"}, "must hold PNG or JPEG images"),
+    ({"images": "twice"}, "different names"),
+])  # fmt: skip
 def test_what_cannot_be_a_film_is_refused_in_words(tmp_path: Path, sources: dict[str, str], said: str) -> None:
     write_wrong(tmp_path)
     with pytest.raises(ValueError, match=said):

@@ -76,17 +76,14 @@ def test_what_is_masked_has_no_features(captured: Path, tmp_path: Path) -> None:
         capture(tmp_path / "out", find_films(images=captured / "images"), settings, num_frames=5)
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda frame, index: frame, "the camera stands still"),
-        (lambda frame, index: np.full_like(frame, 100 + index), "too little texture"),
-        (
-            lambda frame, index: np.random.default_rng(index).integers(0, 256, frame.shape, dtype=np.uint8),
-            "frames show nothing in common",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda frame, index: frame, "the camera stands still"),
+    (lambda frame, index: np.full_like(frame, 100 + index), "too little texture"),
+    (
+        lambda frame, index: np.random.default_rng(index).integers(0, 256, frame.shape, dtype=np.uint8),
+        "frames show nothing in common",
+    ),
+])  # fmt: skip
 def test_films_that_show_no_camera_are_refused_in_words(captured: Path, tmp_path: Path, make, said: str) -> None:
     first = np.asarray(Image.open(next((captured / "images").iterdir())))
     write_frames([np.array(make(first, index)) for index in range(6)], tmp_path / "film.mp4", fps=10)

@@ -137,15 +137,12 @@ def test_a_radial_lens_is_refused_where_it_folds_and_else_undone(model: str, rad
     assert radii[low] - 1e-9 <= math.hypot(x, y) <= radii[high] + 1e-9
 
 
-@pytest.mark.parametrize(
-    ("lens", "focal"),
-    [
-        (Distortion("opencv", (-0.5,)), 20.0),  # r - r^3 / 2 turns at r = 0.82
-        (Distortion("opencv", (0.0, 0.0, 0.0, 0.0, 1.0)), 20.0),
-        (Distortion("fisheye", (-0.5,)), 20.0),
-        (Distortion("fisheye"), 20.0),  # 115 degrees in the corners
-    ],
-)
+@pytest.mark.parametrize(("lens", "focal"), [
+    (Distortion("opencv", (-0.5,)), 20.0),  # r - r^3 / 2 turns at r = 0.82
+    (Distortion("opencv", (0.0, 0.0, 0.0, 0.0, 1.0)), 20.0),
+    (Distortion("fisheye", (-0.5,)), 20.0),
+    (Distortion("fisheye"), 20.0),  # 115 degrees in the corners
+])  # fmt: skip
 def test_lenses_that_fold_or_look_sideways_inside_the_image_are_refused(lens: Distortion, focal: float) -> None:
     with pytest.raises(ValueError, match=r"must not fold over .* undistort the images, or crop them"):
         Intrinsics(64, 48, focal, focal, distortion=lens)
@@ -198,16 +195,13 @@ def test_rays_of_many_pinholes_have_the_bits_of_each() -> None:
         assert torch.equal(together.near[i::3], own.near)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("thin prism",), "model must be one of opencv, fisheye"),
-        (("opencv", (0.0,) * 7), "at most six|at most 6"),
-        (("fisheye", (0.0,) * 5), "at most 4"),
-        (("opencv", (math.nan,)), "must be finite"),
-        (("fisheye", (), (0.1, 0.0)), "tangential must be 0"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("thin prism",), "model must be one of opencv, fisheye"),
+    (("opencv", (0.0,) * 7), "at most six|at most 6"),
+    (("fisheye", (0.0,) * 5), "at most 4"),
+    (("opencv", (math.nan,)), "must be finite"),
+    (("fisheye", (), (0.1, 0.0)), "tangential must be 0"),
+])  # fmt: skip
 def test_bad_coefficients_are_refused(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Distortion(*arguments)

@@ -90,21 +90,18 @@ def header(text: str) -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "not a .npy file"),
-        (b"\x93NUMPY\x07\x00", "not a .npy file"),
-        (
-            header("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 17), }\n"),
-            "must hold .* numbers, got 0",
-        ),
-        (header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, -17), }\n") + bytes(136), "must hold"),
-        (header("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n") + pickle.dumps([1]), "floating-point"),
-        (header("__import__('os').system('true')\n"), "not a .npy file"),
-        (header("(" * 9000), "not a .npy file"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (b"", "not a .npy file"),
+    (b"\x93NUMPY\x07\x00", "not a .npy file"),
+    (
+        header("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 17), }\n"),
+        "must hold .* numbers, got 0",
+    ),
+    (header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, -17), }\n") + bytes(136), "must hold"),
+    (header("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n") + pickle.dumps([1]), "floating-point"),
+    (header("__import__('os').system('true')\n"), "not a .npy file"),
+    (header("(" * 9000), "not a .npy file"),
+])  # fmt: skip
 def test_hostile_arrays_are_refused_at_once(root: Path, content: bytes, message: str) -> None:
     (root / "poses_bounds.npy").write_bytes(content)
     begin = time.process_time()
@@ -114,16 +111,13 @@ def test_hostile_arrays_are_refused_at_once(root: Path, content: bytes, message:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        (np.zeros((4, 15)), r"must be an array of cameras x 17, got \(4, 15\)"),
-        (np.zeros((0, 17)), "must be an array of cameras x 17"),
-        (np.full((4, 17), np.nan), "must hold finite numbers"),
-        (np.zeros((4, 17)), "row 0"),
-        (np.zeros((4, 17), int), "must hold floating-point numbers"),
-    ],
-)
+@pytest.mark.parametrize(("rows", "message"), [
+    (np.zeros((4, 15)), r"must be an array of cameras x 17, got \(4, 15\)"),
+    (np.zeros((0, 17)), "must be an array of cameras x 17"),
+    (np.full((4, 17), np.nan), "must hold finite numbers"),
+    (np.zeros((4, 17)), "row 0"),
+    (np.zeros((4, 17), int), "must hold floating-point numbers"),
+])  # fmt: skip
 def test_senseless_rows_are_refused(root: Path, rows: np.ndarray, message: str) -> None:
     np.save(root / "poses_bounds.npy", rows)
     with pytest.raises(ValueError, match=message):

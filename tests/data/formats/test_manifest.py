@@ -77,62 +77,59 @@ def train(capture: Capture) -> tuple[CaptureFrame, ...]:
 MATRIX = r"frames\[1\].transform_matrix"
 
 
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (lambda m: m.pop("frames"), r"frames must be a list with at least one frame, got None"),
-        (top(frames=[]), r"frames must be a list with at least one frame, got \[\]"),
-        (top(frames={"a": 1}), r"frames must be a list"),
-        (lambda m: m["frames"].insert(1, "x"), r"frames\[1\] must be an object, got 'x'"),
-        (frame(time=...), r"frames\[1\].time is missing, other frames have it; give it to all, or to none"),
-        (lambda m: m.update(frames=dict(enumerate(m["frames"]))), r"frames must be a list .{,165}\.\.\.$"),
-        (frame(time=math.nan), r"frames\[1\].time must be a number .* got nan; export it again, or take"),
-        (frame(time="0.5"), r"frames\[1\].time must be a number .* got '0.5'; write it without quotes"),
-        (frame(time=True), r"frames\[1\].time must be a number .* got True"),
-        (frame(time=10**400), r"frames\[1\].time must be a number .* got 1000"),
-        (frame(transform_matrix=...), r"frames\[1\].transform_matrix is missing"),
-        (frame(transform_matrix=[[1, 0], [0, 1]]), MATRIX + " must be a list of 4 lists of 4 numbers or a list of 3"),
-        (frame(transform_matrix="eye"), MATRIX + " must be a list of 4 lists of 4"),
-        (entry(0, 3, math.nan), MATRIX + r"\[0\]\[3\] must be a number .* got nan"),
-        (entry(1, 1, None), MATRIX + r"\[1\]\[1\] must be a number .* got None"),
-        (entry(2, 2, 1.1), MATRIX + r" must be rigid: three orthonormal columns .*; export it without shear"),
-        (entry(3, 0, 0.5), MATRIX + r" must have the last row 0 0 0 1, got \[0.5 0 0 1\]"),
-        (
-            frame(transform_matrix=np.array(data_folders.poses()[1]).T.tolist()),
-            MATRIX + " must have the last row 0 0 0 1, .*; it looks transposed: list rows",
-        ),
-        (
-            frame(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()),
-            MATRIX + r" must be rigid and right-handed, it mirrors \(determinant -1\); negate one axis",
-        ),
-        (frame(transform_matrix=np.diag([0.0, 0, 0, 1]).tolist()), MATRIX + r" must be rigid"),
-        (frame(file_path=...), r"frames\[1\].file_path is missing"),
-        (frame(file_path=3), r"frames\[1\].file_path must be printable text, got 3"),
-        (frame(file_path="train/r_1\0"), r"frames\[1\].file_path must be printable text, got 'train/r_1\\x00'"),
-        (frame(file_path="train/\ud800"), r"frames\[1\].file_path must be printable text"),
-        (frame(file_path="x" * 5000), r"frames\[1\].file_path must be printable text"),
-        (frame(file_path="ü" * 200), r"frames\[1\].file_path must have names of at most 255 bytes"),
-        (frame(file_path=""), r"frames\[1\].file_path must be printable text"),
-        (frame(file_path="."), r"frames\[1\].file_path must stay inside"),
-        (frame(file_path="/etc/passwd"), r"frames\[1\].file_path must stay inside .*; write it relative to"),
-        (frame(file_path="C:\\x\\y.png"), r"frames\[1\].file_path must stay inside"),
-        (frame(file_path="../../etc/passwd"), r"frames\[1\].file_path must stay inside"),
-        (all_frames(file_path="train/gone"), r"none of its 4 images is there, the first is .*train/gone; put them"),
-        (frame(mask_path="masks/m.png"), r"frames\[1\].mask_path: no mask .*; put it there, or remove mask_path"),
-        (frame(mask_path=3), r"frames\[1\].mask_path must be printable text"),
-        (top(near=7.0, far=6.0), "near must be less than far, got 7 and 6"),
-        (top(near=-1), "near must be a number"),
-        (top(background="white"), "background must be a list of 3 numbers, got 'white'"),
-        (top(background=[0, 0, 1.5]), r"background\[2\] must be a number in \[0, 1\], got 1.5"),
-        (top(pixel_origin="middle"), "pixel_origin must be one of center, corner"),
-        (top(pixel_origin=["center"]), "pixel_origin must be one of center, corner"),
-        (top(up=[0, 0, 0]), "up must have a length"),
-        (top(rolling_shutter=[0, 0, 0, 1]), "rolling_shutter cannot be followed, .* no rolling shutter"),
-        (frame(transform_matrix_start=[[1]]), r"frames\[1\].transform_matrix_start cannot be followed"),
-        (top(latlong=True), "latlong cannot be followed, got True: .*undistort"),
-        (top(white_transparent=True), "white_transparent cannot be followed, .*write an alpha channel"),
-    ],
-)
+@pytest.mark.parametrize(("edit", "message"), [
+    (lambda m: m.pop("frames"), r"frames must be a list with at least one frame, got None"),
+    (top(frames=[]), r"frames must be a list with at least one frame, got \[\]"),
+    (top(frames={"a": 1}), r"frames must be a list"),
+    (lambda m: m["frames"].insert(1, "x"), r"frames\[1\] must be an object, got 'x'"),
+    (frame(time=...), r"frames\[1\].time is missing, other frames have it; give it to all, or to none"),
+    (lambda m: m.update(frames=dict(enumerate(m["frames"]))), r"frames must be a list .{,165}\.\.\.$"),
+    (frame(time=math.nan), r"frames\[1\].time must be a number .* got nan; export it again, or take"),
+    (frame(time="0.5"), r"frames\[1\].time must be a number .* got '0.5'; write it without quotes"),
+    (frame(time=True), r"frames\[1\].time must be a number .* got True"),
+    (frame(time=10**400), r"frames\[1\].time must be a number .* got 1000"),
+    (frame(transform_matrix=...), r"frames\[1\].transform_matrix is missing"),
+    (frame(transform_matrix=[[1, 0], [0, 1]]), MATRIX + " must be a list of 4 lists of 4 numbers or a list of 3"),
+    (frame(transform_matrix="eye"), MATRIX + " must be a list of 4 lists of 4"),
+    (entry(0, 3, math.nan), MATRIX + r"\[0\]\[3\] must be a number .* got nan"),
+    (entry(1, 1, None), MATRIX + r"\[1\]\[1\] must be a number .* got None"),
+    (entry(2, 2, 1.1), MATRIX + r" must be rigid: three orthonormal columns .*; export it without shear"),
+    (entry(3, 0, 0.5), MATRIX + r" must have the last row 0 0 0 1, got \[0.5 0 0 1\]"),
+    (
+        frame(transform_matrix=np.array(data_folders.poses()[1]).T.tolist()),
+        MATRIX + " must have the last row 0 0 0 1, .*; it looks transposed: list rows",
+    ),
+    (
+        frame(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()),
+        MATRIX + r" must be rigid and right-handed, it mirrors \(determinant -1\); negate one axis",
+    ),
+    (frame(transform_matrix=np.diag([0.0, 0, 0, 1]).tolist()), MATRIX + r" must be rigid"),
+    (frame(file_path=...), r"frames\[1\].file_path is missing"),
+    (frame(file_path=3), r"frames\[1\].file_path must be printable text, got 3"),
+    (frame(file_path="train/r_1\0"), r"frames\[1\].file_path must be printable text, got 'train/r_1\\x00'"),
+    (frame(file_path="train/\ud800"), r"frames\[1\].file_path must be printable text"),
+    (frame(file_path="x" * 5000), r"frames\[1\].file_path must be printable text"),
+    (frame(file_path="ü" * 200), r"frames\[1\].file_path must have names of at most 255 bytes"),
+    (frame(file_path=""), r"frames\[1\].file_path must be printable text"),
+    (frame(file_path="."), r"frames\[1\].file_path must stay inside"),
+    (frame(file_path="/etc/passwd"), r"frames\[1\].file_path must stay inside .*; write it relative to"),
+    (frame(file_path="C:\\x\\y.png"), r"frames\[1\].file_path must stay inside"),
+    (frame(file_path="../../etc/passwd"), r"frames\[1\].file_path must stay inside"),
+    (all_frames(file_path="train/gone"), r"none of its 4 images is there, the first is .*train/gone; put them"),
+    (frame(mask_path="masks/m.png"), r"frames\[1\].mask_path: no mask .*; put it there, or remove mask_path"),
+    (frame(mask_path=3), r"frames\[1\].mask_path must be printable text"),
+    (top(near=7.0, far=6.0), "near must be less than far, got 7 and 6"),
+    (top(near=-1), "near must be a number"),
+    (top(background="white"), "background must be a list of 3 numbers, got 'white'"),
+    (top(background=[0, 0, 1.5]), r"background\[2\] must be a number in \[0, 1\], got 1.5"),
+    (top(pixel_origin="middle"), "pixel_origin must be one of center, corner"),
+    (top(pixel_origin=["center"]), "pixel_origin must be one of center, corner"),
+    (top(up=[0, 0, 0]), "up must have a length"),
+    (top(rolling_shutter=[0, 0, 0, 1]), "rolling_shutter cannot be followed, .* no rolling shutter"),
+    (frame(transform_matrix_start=[[1]]), r"frames\[1\].transform_matrix_start cannot be followed"),
+    (top(latlong=True), "latlong cannot be followed, got True: .*undistort"),
+    (top(white_transparent=True), "white_transparent cannot be followed, .*write an alpha channel"),
+])  # fmt: skip
 def test_bad_fields_are_named_in_one_line(root: Path, edit: Edit, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         read_capture(edited(root, edit))
@@ -140,25 +137,22 @@ def test_bad_fields_are_named_in_one_line(root: Path, edit: Edit, message: str) 
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "malformed JSON at line 1 column 1"),
-        (b'{"frames": [\n  wrong]}', "malformed JSON at line 2 column 3: .*; correct it there, or export it again"),
-        (b'{"frames": [1, 2,\n ]}', "malformed JSON at line .*; remove the comma before the bracket"),
-        (b'{"frames": 1, }', "malformed JSON at line 1 .*; remove the comma before the bracket"),
-        (b'{"frames": }', "malformed JSON at line 1 .*; correct it there"),
-        (b"// mine\n{}", "malformed JSON at line 1 column 1: .*; JSON has no comments: remove them"),
-        (b"version https://git-lfs.github.com/spec/v1\n", "it is a Git LFS pointer: git lfs pull fetches"),
-        ("{}".encode("utf-16"), "not UTF-8 at byte 0; it is UTF-16: save it as UTF-8"),
-        (b"[1, 2]", r"must hold an object, got \[1, 2\]"),
-        (b'{"frames": "\xff\xfe"}', "not UTF-8 at byte 12"),
-        (b"[" * 100_000, "malformed JSON: nested too deeply"),
-        (b'{"camera_angle_x": ' + b"1" * 10_000 + b"}", "malformed JSON: Exceeds the limit"),
-        (b" " * (MAX_BYTES + 1), "file must be at most 16 MiB"),
-        (json.dumps({"frames": [{}] * 100_000}).encode(), f"frames must be at most {MAX_FRAMES}, got 100000"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (b"", "malformed JSON at line 1 column 1"),
+    (b'{"frames": [\n  wrong]}', "malformed JSON at line 2 column 3: .*; correct it there, or export it again"),
+    (b'{"frames": [1, 2,\n ]}', "malformed JSON at line .*; remove the comma before the bracket"),
+    (b'{"frames": 1, }', "malformed JSON at line 1 .*; remove the comma before the bracket"),
+    (b'{"frames": }', "malformed JSON at line 1 .*; correct it there"),
+    (b"// mine\n{}", "malformed JSON at line 1 column 1: .*; JSON has no comments: remove them"),
+    (b"version https://git-lfs.github.com/spec/v1\n", "it is a Git LFS pointer: git lfs pull fetches"),
+    ("{}".encode("utf-16"), "not UTF-8 at byte 0; it is UTF-16: save it as UTF-8"),
+    (b"[1, 2]", r"must hold an object, got \[1, 2\]"),
+    (b'{"frames": "\xff\xfe"}', "not UTF-8 at byte 12"),
+    (b"[" * 100_000, "malformed JSON: nested too deeply"),
+    (b'{"camera_angle_x": ' + b"1" * 10_000 + b"}", "malformed JSON: Exceeds the limit"),
+    (b" " * (MAX_BYTES + 1), "file must be at most 16 MiB"),
+    (json.dumps({"frames": [{}] * 100_000}).encode(), f"frames must be at most {MAX_FRAMES}, got 100000"),
+])  # fmt: skip
 def test_malformed_files_are_refused(root: Path, content: bytes, message: str) -> None:
     (root / "transforms_train.json").write_bytes(content)
     with pytest.raises(ValueError, match=message) as caught:
@@ -305,23 +299,20 @@ K = [[9.5, 0, 3.5], [0, 10.5, 2.5], [0, 0, 1]]
 OWN = {"fl_x": 9.5, "fl_y": 10.5, "cx": 3.5, "cy": 2.5, "w": 8, "h": 6.0}
 
 
-@pytest.mark.parametrize(
-    ("edit", "expected"),
-    [
-        (top(camera_angle_x=2 * math.atan(0.5)), (8, 6, 8, 8, 4, 3)),
-        (top(camera_angle_x=2 * math.atan(0.5), camera_angle_y=2 * math.atan(0.25)), (8, 6, 8, 12, 4, 3)),
-        (top(camera_angle_x=..., camera_angle_y=2 * math.atan(0.25)), (8, 6, 12, 12, 4, 3)),
-        (top(fl_x=9.5), (8, 6, 9.5, 9.5, 4, 3)),
-        (top(fl_x=9.5, camera_angle_y=2 * math.atan(0.25)), (8, 6, 9.5, 12, 4, 3)),
-        (top(**OWN, camera_angle_y=1.0), (8, 6, 9.5, 10.5, 3.5, 2.5)),
-        (all_frames(**OWN), (8, 6, 9.5, 10.5, 3.5, 2.5)),
-        (top(K=K), (8, 6, 9.5, 10.5, 3.5, 2.5)),
-        (top(intrinsic_matrix=K), (8, 6, 9.5, 10.5, 3.5, 2.5)),
-        (lambda m: (top(fl_x=1.5, cx=7, cy=1, w=8, h=6)(m), all_frames(K=K)(m)), (8, 6, 9.5, 10.5, 3.5, 2.5)),
-        (lambda m: (top(fl_x=1.5, fl_y=3, cx=7, cy=1)(m), all_frames(fl_x=9.5)(m)), (8, 6, 9.5, 9.5, 7, 1)),
-        (top(fl_x=38, cx=16, cy=12, w=32, h=24), (32, 24, 38, 38, 16, 12)),
-    ],
-)
+@pytest.mark.parametrize(("edit", "expected"), [
+    (top(camera_angle_x=2 * math.atan(0.5)), (8, 6, 8, 8, 4, 3)),
+    (top(camera_angle_x=2 * math.atan(0.5), camera_angle_y=2 * math.atan(0.25)), (8, 6, 8, 12, 4, 3)),
+    (top(camera_angle_x=..., camera_angle_y=2 * math.atan(0.25)), (8, 6, 12, 12, 4, 3)),
+    (top(fl_x=9.5), (8, 6, 9.5, 9.5, 4, 3)),
+    (top(fl_x=9.5, camera_angle_y=2 * math.atan(0.25)), (8, 6, 9.5, 12, 4, 3)),
+    (top(**OWN, camera_angle_y=1.0), (8, 6, 9.5, 10.5, 3.5, 2.5)),
+    (all_frames(**OWN), (8, 6, 9.5, 10.5, 3.5, 2.5)),
+    (top(K=K), (8, 6, 9.5, 10.5, 3.5, 2.5)),
+    (top(intrinsic_matrix=K), (8, 6, 9.5, 10.5, 3.5, 2.5)),
+    (lambda m: (top(fl_x=1.5, cx=7, cy=1, w=8, h=6)(m), all_frames(K=K)(m)), (8, 6, 9.5, 10.5, 3.5, 2.5)),
+    (lambda m: (top(fl_x=1.5, fl_y=3, cx=7, cy=1)(m), all_frames(fl_x=9.5)(m)), (8, 6, 9.5, 9.5, 7, 1)),
+    (top(fl_x=38, cx=16, cy=12, w=32, h=24), (32, 24, 38, 38, 16, 12)),
+])  # fmt: skip
 def test_intrinsics_follow_from_what_says_most(root: Path, edit: Edit, expected: tuple) -> None:
     """A frame's own before the file's, matrices before focal lengths before angles; one means square pixels."""
     for found in intrinsics(root, edit):
@@ -336,20 +327,17 @@ def test_every_frame_may_have_its_own_camera(root: Path) -> None:
     assert [found[2] for found in intrinsics(root, edit)] == [FOCAL, 1.5 * FOCAL, 2 * FOCAL, 2.5 * FOCAL]
 
 
-@pytest.mark.parametrize(
-    ("fields", "expected"),
-    [
-        ({}, None),
-        ({"camera_model": "OPENCV", "k1": 0.0, "p2": 0}, None),
-        ({"k1": 0.1, "k2": -0.01, "p1": 0.001, "p2": -0.002}, Distortion("opencv", (0.1, -0.01), (0.001, -0.002))),
-        ({"camera_model": "SIMPLE_RADIAL", "k1": 0.1}, Distortion("opencv", (0.1,))),
-        ({"camera_model": "opencv", "k3": 0.1}, Distortion("opencv", (0.0, 0.0, 0.1))),
-        ({"camera_model": "FULL_OPENCV", "k4": 0.1}, Distortion("opencv", (0.0, 0.0, 0.0, 0.1))),
-        ({"is_fisheye": False, "k1": 0.1}, Distortion("opencv", (0.1,))),
-        ({"is_fisheye": True}, Distortion("fisheye", (0.0,) * 4)),
-        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.01}, Distortion("fisheye", (0.0, 0.0, 0.0, 0.01))),
-    ],
-)
+@pytest.mark.parametrize(("fields", "expected"), [
+    ({}, None),
+    ({"camera_model": "OPENCV", "k1": 0.0, "p2": 0}, None),
+    ({"k1": 0.1, "k2": -0.01, "p1": 0.001, "p2": -0.002}, Distortion("opencv", (0.1, -0.01), (0.001, -0.002))),
+    ({"camera_model": "SIMPLE_RADIAL", "k1": 0.1}, Distortion("opencv", (0.1,))),
+    ({"camera_model": "opencv", "k3": 0.1}, Distortion("opencv", (0.0, 0.0, 0.1))),
+    ({"camera_model": "FULL_OPENCV", "k4": 0.1}, Distortion("opencv", (0.0, 0.0, 0.0, 0.1))),
+    ({"is_fisheye": False, "k1": 0.1}, Distortion("opencv", (0.1,))),
+    ({"is_fisheye": True}, Distortion("fisheye", (0.0,) * 4)),
+    ({"camera_model": "OPENCV_FISHEYE", "k4": 0.01}, Distortion("fisheye", (0.0, 0.0, 0.0, 0.01))),
+])  # fmt: skip
 def test_lenses_are_opencvs(root: Path, fields: dict, expected: Distortion | None) -> None:
     assert train(read_capture(edited(root, top(**fields))))[0].intrinsics.distortion == expected
 
@@ -359,37 +347,34 @@ def test_a_frames_own_coefficients_come_before_the_files(root: Path) -> None:
     assert [f.intrinsics.distortion.radial for f in frames[:2]] == [(0.1, 0.01), (0.2, 0.01)]  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"camera_angle_x": ...}, "camera_angle_x, fl_x or K must be given, got none; add the"),
-        ({"camera_angle_x": math.nan}, "camera_angle_x must be a number in .* got nan"),
-        ({"camera_angle_x": 39.6}, "camera_angle_x must be in radians, below pi, got 39.6; that may be 0.69115"),
-        ({"camera_angle_x": 400}, "camera_angle_x must be a number in .* got 400"),
-        ({"fl_x": 0.3}, "fl_x must be in pixels of images 8 across, got 0.3; multiply it by 8 if it is a share"),
-        ({"fl_x": -9}, "fl_x must be a number in .* got -9"),
-        ({"fl_x": 9, "fl_y": 0}, "fl_y must be a number in .* got 0"),
-        ({"cx": 0.5, "cy": 0.5}, "cx: the principal point must be in pixels of images of 8 x 6, got 0.5, 0.5; multip"),
-        ({"K": [[9, 0, 0.5], [0, 9, 0.4], [0, 0, 1]]}, "K: the principal point must be in pixels .* got 0.5, 0.4"),
-        ({"cx": math.nan}, "cx must be a number in .* got nan"),
-        ({"cx": 32, "cy": 24}, "cx and cy lie at 32, 24, far outside of images of 8 x 6; add w and h"),
-        ({"w": 8.5, "h": 6}, "w must be a whole number, got 8.5"),
-        ({"w": 8, "h": 10**400}, "h must be a number in .* got 1000"),
-        ({"K": [[9, 0, 4], [0, 9, 3]]}, "K must be a list of 3 lists of 3 numbers"),
-        ({"K": [[9, 1, 4], [0, 9, 3], [0, 0, 1]]}, r"K\[0\]\[1\] must be 0, got 1: pixels without skew"),
-        ({"K": [[9, 0, 4], [0, 9, 3], [0, 0, 2]]}, "K must have the rows fx 0 cx, 0 fy cy and 0 0 1"),
-        ({"k1": "x"}, "k1 must be a number"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of PINHOLE, .*; undistort the images"),
-        ({"camera_model": 3}, "camera_model must be one of"),
-        ({"camera_model": "PINHOLE", "k1": 0.1}, "camera_model must not be PINHOLE with lens coefficients"),
-        ({"camera_model": "OPENCV", "k4": 0.1}, "k4 must be 0 with camera_model OPENCV, .*; write FULL_OPENCV"),
-        ({"k4": 0.1}, "k4 must be 0 with camera_model OPENCV"),
-        ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye must agree with camera_model OPENCV"),
-        ({"is_fisheye": "yes"}, "is_fisheye must be true or false, got 'yes'"),
-        ({"is_fisheye": True, "p1": 0.1}, "p1 must be 0 of a fisheye lens, got 0.1"),
-        ({"k1": -9.0}, r"frames\[0\]: .*lens|distortion"),
-    ],
-)
+@pytest.mark.parametrize(("fields", "message"), [
+    ({"camera_angle_x": ...}, "camera_angle_x, fl_x or K must be given, got none; add the"),
+    ({"camera_angle_x": math.nan}, "camera_angle_x must be a number in .* got nan"),
+    ({"camera_angle_x": 39.6}, "camera_angle_x must be in radians, below pi, got 39.6; that may be 0.69115"),
+    ({"camera_angle_x": 400}, "camera_angle_x must be a number in .* got 400"),
+    ({"fl_x": 0.3}, "fl_x must be in pixels of images 8 across, got 0.3; multiply it by 8 if it is a share"),
+    ({"fl_x": -9}, "fl_x must be a number in .* got -9"),
+    ({"fl_x": 9, "fl_y": 0}, "fl_y must be a number in .* got 0"),
+    ({"cx": 0.5, "cy": 0.5}, "cx: the principal point must be in pixels of images of 8 x 6, got 0.5, 0.5; multip"),
+    ({"K": [[9, 0, 0.5], [0, 9, 0.4], [0, 0, 1]]}, "K: the principal point must be in pixels .* got 0.5, 0.4"),
+    ({"cx": math.nan}, "cx must be a number in .* got nan"),
+    ({"cx": 32, "cy": 24}, "cx and cy lie at 32, 24, far outside of images of 8 x 6; add w and h"),
+    ({"w": 8.5, "h": 6}, "w must be a whole number, got 8.5"),
+    ({"w": 8, "h": 10**400}, "h must be a number in .* got 1000"),
+    ({"K": [[9, 0, 4], [0, 9, 3]]}, "K must be a list of 3 lists of 3 numbers"),
+    ({"K": [[9, 1, 4], [0, 9, 3], [0, 0, 1]]}, r"K\[0\]\[1\] must be 0, got 1: pixels without skew"),
+    ({"K": [[9, 0, 4], [0, 9, 3], [0, 0, 2]]}, "K must have the rows fx 0 cx, 0 fy cy and 0 0 1"),
+    ({"k1": "x"}, "k1 must be a number"),
+    ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of PINHOLE, .*; undistort the images"),
+    ({"camera_model": 3}, "camera_model must be one of"),
+    ({"camera_model": "PINHOLE", "k1": 0.1}, "camera_model must not be PINHOLE with lens coefficients"),
+    ({"camera_model": "OPENCV", "k4": 0.1}, "k4 must be 0 with camera_model OPENCV, .*; write FULL_OPENCV"),
+    ({"k4": 0.1}, "k4 must be 0 with camera_model OPENCV"),
+    ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye must agree with camera_model OPENCV"),
+    ({"is_fisheye": "yes"}, "is_fisheye must be true or false, got 'yes'"),
+    ({"is_fisheye": True, "p1": 0.1}, "p1 must be 0 of a fisheye lens, got 0.1"),
+    ({"k1": -9.0}, r"frames\[0\]: .*lens|distortion"),
+])  # fmt: skip
 def test_senseless_cameras_are_refused(root: Path, fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         read_capture(edited(root, top(**fields)))

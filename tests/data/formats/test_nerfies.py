@@ -72,15 +72,12 @@ def test_frames_for_validation_are_the_test_split(root: Path) -> None:
     assert {split: len(frames) for split, frames in read_capture(root).splits.items()} == {"all": 4}
 
 
-@pytest.mark.parametrize(
-    ("metadata", "times"),
-    [
-        ([0, 1, 2, 3], [0, 1, 2, 3]),
-        ([0, 0, 1, 2], [0, 1, 2, 3]),  # the frame for validation carries its neighbour's embedding
-        ([0, 1, 0, 1], [0, 1, 0, 1]),  # two cameras: names number the images, not the moments
-        (None, [0, 1, 2, 3]),
-    ],
-)
+@pytest.mark.parametrize(("metadata", "times"), [
+    ([0, 1, 2, 3], [0, 1, 2, 3]),
+    ([0, 0, 1, 2], [0, 1, 2, 3]),  # the frame for validation carries its neighbour's embedding
+    ([0, 1, 0, 1], [0, 1, 0, 1]),  # two cameras: names number the images, not the moments
+    (None, [0, 1, 2, 3]),
+])  # fmt: skip
 def test_times_are_numbers_in_names_unless_metadata_disagrees(root: Path, metadata: Any, times: list) -> None:
     edit(root / "dataset.json", train_ids=["000000", "000002", "000003"], val_ids=["000001"])
     ids = [f"{index:06d}" for index in range(4)]
@@ -102,26 +99,23 @@ def test_points_and_up_are_read_in_the_cameras_units(root: Path) -> None:
     assert capture.up == (0, -1, 0)
 
 
-@pytest.mark.parametrize(
-    ("file", "changes", "message"),
-    [
-        ("dataset.json", {"train_ids": ["../x"]}, r"train_ids\[0\] must be a plain name such as 000001, got '../x'"),
-        ("dataset.json", {"train_ids": "all"}, "train_ids must be a list of at most"),
-        ("dataset.json", {"train_ids": ..., "ids": []}, "ids must name at least one frame"),
-        ("dataset.json", {"train_ids": ["000009"]}, "no image of dataset.json is there, looked for rgb/1x/000009.png"),
-        ("camera/000002.json", {"orientation": ...}, r"000002.json.orientation is missing"),
-        ("camera/000002.json", {"orientation": [[1, 0], [0, 1]]}, "orientation must be a list of 3 lists of 3"),
-        ("camera/000002.json", {"orientation": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]}, "orientation must be rigid"),
-        ("camera/000002.json", {"image_size": [8, 6.5]}, r"image_size\[1\] must be a whole number"),
-        ("camera/000002.json", {"image_size": 8}, "image_size must be a list of width and height"),
-        ("camera/000002.json", {"skew": 3.0}, "skew must be 0, got 3"),
-        ("camera/000002.json", {"focal_length": 0}, "focal_length must be a number"),
-        ("camera/000002.json", {"radial_distortion": [0]}, "radial_distortion must be a list of 3 numbers"),
-        ("camera/000002.json", {"radial_distortion": [-9.0, 0, 0]}, "000002.json: "),
-        ("scene.json", {"scale": 0}, "scale must be a number"),
-        ("scene.json", {"near": 9}, "near must be less than far"),
-    ],
-)
+@pytest.mark.parametrize(("file", "changes", "message"), [
+    ("dataset.json", {"train_ids": ["../x"]}, r"train_ids\[0\] must be a plain name such as 000001, got '../x'"),
+    ("dataset.json", {"train_ids": "all"}, "train_ids must be a list of at most"),
+    ("dataset.json", {"train_ids": ..., "ids": []}, "ids must name at least one frame"),
+    ("dataset.json", {"train_ids": ["000009"]}, "no image of dataset.json is there, looked for rgb/1x/000009.png"),
+    ("camera/000002.json", {"orientation": ...}, r"000002.json.orientation is missing"),
+    ("camera/000002.json", {"orientation": [[1, 0], [0, 1]]}, "orientation must be a list of 3 lists of 3"),
+    ("camera/000002.json", {"orientation": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]}, "orientation must be rigid"),
+    ("camera/000002.json", {"image_size": [8, 6.5]}, r"image_size\[1\] must be a whole number"),
+    ("camera/000002.json", {"image_size": 8}, "image_size must be a list of width and height"),
+    ("camera/000002.json", {"skew": 3.0}, "skew must be 0, got 3"),
+    ("camera/000002.json", {"focal_length": 0}, "focal_length must be a number"),
+    ("camera/000002.json", {"radial_distortion": [0]}, "radial_distortion must be a list of 3 numbers"),
+    ("camera/000002.json", {"radial_distortion": [-9.0, 0, 0]}, "000002.json: "),
+    ("scene.json", {"scale": 0}, "scale must be a number"),
+    ("scene.json", {"near": 9}, "near must be less than far"),
+])  # fmt: skip
 def test_bad_fields_are_named_in_one_line(root: Path, file: str, changes: dict, message: str) -> None:
     edit(root / file, **changes)
     with pytest.raises(ValueError, match=message) as caught:

@@ -48,21 +48,18 @@ def test_many_points_are_thinned_out_and_those_that_are_not_finite_left_out(tmp_
     assert read_ply(path) is None
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "not a PLY file"),
-        (b"ply\n" + b"x" * 100_000, "not a PLY file"),
-        (HEADER.format("binary_little_endian", 10**9, XYZ).encode(), "properties|vertices"),
-        (HEADER.format("binary_little_endian", 999_999_999, XYZ).encode(), "must hold 999999999 vertices of 12 bytes"),
-        (HEADER.format("binary_little_endian", -1, XYZ).encode(), "vertices must be a number of points"),
-        (HEADER.format("ascii", 999_999_999, XYZ).encode() + b"1 2 3\n", "line 2 is not"),
-        (HEADER.format("zip", 1, XYZ).encode(), "must have a known format"),
-        (HEADER.format("ascii", 1, "property list uchar int x").encode(), "must be single numbers"),
-        (HEADER.format("ascii", 1, "property float x").encode() + b"1\n", "with x, y and z"),
-        (HEADER.format("ascii", 1, XYZ + "\nproperty float x").encode(), "must be single numbers"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (b"", "not a PLY file"),
+    (b"ply\n" + b"x" * 100_000, "not a PLY file"),
+    (HEADER.format("binary_little_endian", 10**9, XYZ).encode(), "properties|vertices"),
+    (HEADER.format("binary_little_endian", 999_999_999, XYZ).encode(), "must hold 999999999 vertices of 12 bytes"),
+    (HEADER.format("binary_little_endian", -1, XYZ).encode(), "vertices must be a number of points"),
+    (HEADER.format("ascii", 999_999_999, XYZ).encode() + b"1 2 3\n", "line 2 is not"),
+    (HEADER.format("zip", 1, XYZ).encode(), "must have a known format"),
+    (HEADER.format("ascii", 1, "property list uchar int x").encode(), "must be single numbers"),
+    (HEADER.format("ascii", 1, "property float x").encode() + b"1\n", "with x, y and z"),
+    (HEADER.format("ascii", 1, XYZ + "\nproperty float x").encode(), "must be single numbers"),
+])  # fmt: skip
 def test_hostile_files_are_refused_at_once(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "p.ply"
     path.write_bytes(content)

@@ -42,26 +42,23 @@ def test_axes_may_be_opencvs_and_lenses_are_those_of_manifests(root: Path) -> No
         read_capture(root)
 
 
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (lambda f: f.update(train_videos=[]), "train_videos must name at least one video"),
-        (lambda f: f.update(train_videos="x"), "train_videos must be a list of videos, got 'x'"),
-        (lambda f: f.update(test_videos=[3]), r"test_videos\[0\] must be an object, got 3"),
-        (lambda f: f.update(near=2, far=1), "near must be less than far, got 2 and 1"),
-        (lambda f: f.update(frame_bkg_color=[0, 0]), "frame_bkg_color must be a list of 3 numbers"),
-        (video(file_name="none.mp4"), r"train_videos\[1\].file_name: no video .*none.mp4; put it there"),
-        (video(file_name="../train01.mp4"), "must stay inside the data set's folder"),
-        (video(file_name="/etc/passwd"), "must stay inside the data set's folder"),
-        (video(frame_num=0), r"train_videos\[1\].frame_num must be a number in \[1, 10000\], got 0"),
-        (video(frame_num=10_000), "frames of all videos must be at most 10000, got more"),
-        (video(frame_num=10**9), "frame_num must be a number"),
-        (video(frame_rate=0), "frame_rate must be a number"),
-        (video(camera_hw=[6]), "camera_hw must be a list of 2 numbers"),
-        (video(transform_matrix=None), r"train_videos\[1\].transform_matrix is missing"),
-        (video(camera_angle_x=None), "camera_angle_x, fl_x or K must be given"),
-    ],
-)
+@pytest.mark.parametrize(("edit", "message"), [
+    (lambda f: f.update(train_videos=[]), "train_videos must name at least one video"),
+    (lambda f: f.update(train_videos="x"), "train_videos must be a list of videos, got 'x'"),
+    (lambda f: f.update(test_videos=[3]), r"test_videos\[0\] must be an object, got 3"),
+    (lambda f: f.update(near=2, far=1), "near must be less than far, got 2 and 1"),
+    (lambda f: f.update(frame_bkg_color=[0, 0]), "frame_bkg_color must be a list of 3 numbers"),
+    (video(file_name="none.mp4"), r"train_videos\[1\].file_name: no video .*none.mp4; put it there"),
+    (video(file_name="../train01.mp4"), "must stay inside the data set's folder"),
+    (video(file_name="/etc/passwd"), "must stay inside the data set's folder"),
+    (video(frame_num=0), r"train_videos\[1\].frame_num must be a number in \[1, 10000\], got 0"),
+    (video(frame_num=10_000), "frames of all videos must be at most 10000, got more"),
+    (video(frame_num=10**9), "frame_num must be a number"),
+    (video(frame_rate=0), "frame_rate must be a number"),
+    (video(camera_hw=[6]), "camera_hw must be a list of 2 numbers"),
+    (video(transform_matrix=None), r"train_videos\[1\].transform_matrix is missing"),
+    (video(camera_angle_x=None), "camera_angle_x, fl_x or K must be given"),
+])  # fmt: skip
 def test_bad_fields_are_named_in_one_line(root: Path, edit: Callable, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         read_capture(edited(root, edit))
