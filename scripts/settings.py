@@ -73,8 +73,8 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
         "run": TEXT.or_null(), "runs": TEXTS, "protocol": TEXT.or_null(), "split": SPLIT, "label": TEXT.or_null(),
         "lego_split": _one_of("test", "val").or_null(), "table": TEXT.or_null(), "max_frames": POSITIVE.or_null(),
         "worst": COUNT, "kinds": TRUTH, "plots": TRUTH, "consistency": TRUTH, "lpips.enabled": TRUTH,
-        "lpips.download": TRUTH, "temporal.enabled": TRUTH, "temporal.num_frames": _whole(3), "temporal.resolution": POSITIVE,
-        "chunk": POSITIVE.or_null(),
+        "lpips.download": TRUTH, "temporal.enabled": TRUTH, "temporal.num_frames": _whole(3),
+        "temporal.resolution": POSITIVE, "chunk": POSITIVE.or_null(),
     },
     "render": {
         "format": SEVERAL, "outputs": SEVERAL, "keep_frames": TRUTH, "chunk": POSITIVE.or_null(),
