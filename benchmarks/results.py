@@ -8,6 +8,7 @@ from typing import Any
 from benchmarks.kernel_cases import COMPILED, PLAIN, REFERENCE
 from benchmarks.report import markdown_table
 from benchmarks.suite import Row
+from benchmarks.training import PLOT
 
 HEAD = """# Results
 
@@ -49,7 +50,9 @@ def results_page(folder: Path) -> str:
             for row in rows_of(report["tables"][table])
         ]
         if rows:
-            parts += [f"## {title}\n", note + "\n", *markdown_table(rows), "", _commands(own)]
+            plots = [f"{folder.name}/{name}/{PLOT}.png" for name in own if (folder / name / f"{PLOT}.png").is_file()]
+            shown = [f"![Quality against training time]({path})" for path in plots]
+            parts += [f"## {title}\n", note + "\n", *shown, *markdown_table(rows), "", _commands(own)]
         left = {name: report for name, report in left.items() if name not in own}
     if left:
         rows = [{"report": _link(folder, name), "what": report["title"]} for name, report in left.items()]

@@ -9,6 +9,8 @@ from benchmarks.scenes import scene_overrides
 from benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 
 QUICK = {"scenes": ["walker"], "seconds": [1, 3], "seeds": [0], "resolution": 40, "experiments": ["fast"]}
+PLOT = "training"
+STYLES = ("line", "dashed", "points")
 VARIED = ("scenes", "experiments", "seconds", "seeds")
 
 
@@ -43,7 +45,7 @@ def run(settings: Settings) -> SuiteResult:
             Table("Means over seeds", means, "psnr_low, psnr_high: worst and best seed. frames: how many were scored."),
             Table("Runs", rows),
         ],
-        plots=[_plot(scene, means) for scene in options["scenes"] if len(options["seconds"]) > 1],
+        plots=[_plot(means)] if len(options["seconds"]) > 1 else [],
         findings=_findings(means),
     )
 
@@ -90,20 +92,22 @@ def _mean_row(scene: str, experiment: str, seconds: float, runs: list[Run], opti
     }
 
 
-def _plot(scene: str, rows: list[dict[str, Any]]) -> Plot:
-    series = []
-    for experiment in dict.fromkeys(row["experiment"] for row in rows):
-        part = [row for row in rows if row["scene"] == scene and row["experiment"] == experiment]
-        x, y, low, high = ([row[name] for row in part] for name in ("budget_s", "psnr", "psnr_low", "psnr_high"))
-        series.append(Series(experiment, x, y, low, high))
+def _plot(rows: list[dict[str, Any]]) -> Plot:
+    series, scenes = [], list(dict.fromkeys(row["scene"] for row in rows))
+    for number, experiment in enumerate(dict.fromkeys(row["experiment"] for row in rows)):
+        for color, scene in enumerate(scenes):
+            part = [row for row in rows if row["scene"] == scene and row["experiment"] == experiment]
+            x, y, low, high = ([row[name] for row in part] for name in ("budget_s", "psnr", "psnr_low", "psnr_high"))
+            style = STYLES[number % len(STYLES)]
+            series.append(Series(f"{scene}, {experiment}", x, y, low, high, style=style, color=color))
     return Plot(
-        name=f"training_{scene}",
-        title=f"Quality against training time, {scene}",
+        name=PLOT,
+        title="Quality against training time",
         x_label="seconds of training",
         y_label="PSNR of held-out frames (dB)",
         series=series,
         y_log=False,
-        note="Band: worst to best seed. Up and to the left is better.",
+        note="A colour for each scene, a style for each experiment. Band: worst to best seed. Up and left is better.",
     )
 
 

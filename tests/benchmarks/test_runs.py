@@ -77,7 +77,8 @@ def test_training_suite_averages_over_seeds(command, tmp_path):
     row = next(r for r in means if (r["scene"], r["experiment"], r["budget_s"]) == ("static", "dnerf", 8))
     assert (row["psnr"], row["psnr_low"], row["psnr_high"], row["split"], row["frames"]) == (29, 28, 30, "val", 2)
     assert (row["resolution"], row["model_MiB"]) == (50, 0.25)
-    assert [p.name for p in result.plots] == ["training_walker", "training_static"]
+    (plot,) = result.plots
+    assert [(series.label, series.color) for series in plot.series][:2] == [("walker, fast", 0), ("static, fast", 1)]
     calls = (tmp_path / "work" / "calls.txt").read_text().splitlines()
     assert len(calls) == 17
     assert "trainer.num_steps=20 " in calls[0]
