@@ -49,8 +49,7 @@ class AdamMuon(torch.optim.Adam):
     for the size 0.2 sqrt(max(M, N)), which lets both share learning rates.
 
     Args:
-        groups: parameter groups as of Adam, with "orthogonal", a bool, for those made of (M, N) matrices, which lose
-            "orthogonal_decay" times the rate of themselves in each step.
+        groups: parameter groups as of Adam, with "orthogonal", a bool, for those made of (M, N) matrices.
         settings: as of Adam.
 
     Raises:
@@ -58,7 +57,7 @@ class AdamMuon(torch.optim.Adam):
     """
 
     def __init__(self, groups: Iterable[dict[str, Any]], **settings: Any) -> None:
-        listed = [{"orthogonal": False, "orthogonal_decay": 0.0, **group} for group in groups]
+        listed = [{"orthogonal": False, **group} for group in groups]
         for group in listed:
             for parameter in group["params"]:
                 if group["orthogonal"] and parameter.ndim != 2:
@@ -73,7 +72,7 @@ class AdamMuon(torch.optim.Adam):
         for group in self.param_groups:
             if group["orthogonal"]:
                 members = [(p, p.grad) for p in group["params"] if p.grad is not None]
-                self._orthogonal_step(members, group["lr"], group["orthogonal_decay"])
+                self._orthogonal_step(members, group["lr"])
                 held += members
         for parameter, _ in held:  # Adam passes by what has no gradient.
             parameter.grad = None
@@ -98,7 +97,7 @@ class AdamMuon(torch.optim.Adam):
             else:
                 group["lr"] = rate
 
-    def _orthogonal_step(self, members: list[tuple[nn.Parameter, Tensor]], rate: float | Tensor, decay: float) -> None:
+    def _orthogonal_step(self, members: list[tuple[nn.Parameter, Tensor]], rate: float | Tensor) -> None:
         by_shape: dict[torch.Size, list[tuple[nn.Parameter, Tensor]]] = defaultdict(list)
         for parameter, gradient in members:
             state = self.state[parameter]
@@ -110,9 +109,7 @@ class AdamMuon(torch.optim.Adam):
         for shape, alike in by_shape.items():
             steps = orthogonalized(torch.stack([direction for _, direction in alike]))
             steps = steps * (rate * (RMS_OF_ADAM * max(shape) ** 0.5))
-            parameters: list[Tensor] = [parameter for parameter, _ in alike]
-            torch._foreach_mul_(parameters, 1 - rate * decay)
-            torch._foreach_sub_(parameters, list(steps.unbind()))
+            torch._foreach_sub_([parameter for parameter, _ in alike], list(steps.unbind()))
 
 
 def moments_of(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> frozenset[str]:
@@ -133,15 +130,13 @@ class AdamSettings:
         learning_rates: by group, see `dnerf.nn.parameter_groups`; "default" is for all that no name is given for.
         weight_decays: by group, 0 where none is given: so many times itself joins a parameter's gradient. Adam divides
             by the gradients' size: with a small number what images say nothing of falls to zero, and little else moves.
-            Matrices that take orthogonalised steps have a decay of another kind.
+            Matrices that take orthogonalised steps have no decay.
         final_rate: factor on all rates at the end of training, > 0.
         hold_until: progress in [0, 1) until which rates are held.
         warmup_steps: steps over which they rise linearly from near zero.
         betas: Adam's moment decay rates.
         epsilon: Adam's epsilon.
         orthogonal: whether the matrices that modules declare so take orthogonalised steps, see `AdamMuon`.
-        orthogonal_decay: of these, see there. Their steps have one size, so without it they grow as long as training
-            goes on, and motion gets rough between the frames.
 
     Raises:
         ValueError: for numbers out of range, or rates without a default.
@@ -150,7 +145,7 @@ class AdamSettings:
     def __init__(
         self, learning_rates: Mapping[str, float] | None = None, *, weight_decays: Mapping[str, float] | None = None,
         final_rate: float = 0.1, hold_until: float = 0.0, warmup_steps: int = 0, betas: Sequence[float] = (0.9, 0.999),
-        epsilon: float = 1e-8, orthogonal: bool = False, orthogonal_decay: float = 0.5,
+        epsilon: float = 1e-8, orthogonal: bool = False,
     ) -> None:  # fmt: skip
         self.learning_rates = {DEFAULT: 5e-4} if learning_rates is None else learning_rates
         check_mapping("learning_rates", self.learning_rates, allow_zero=True)
@@ -159,7 +154,6 @@ class AdamSettings:
         if DEFAULT not in self.learning_rates:
             raise ValueError(f"learning_rates must have a rate for {DEFAULT!r}, got {self.learning_rates}")
         check_positive("final_rate", final_rate)
-        check_positive("orthogonal_decay", orthogonal_decay, allow_zero=True)
         check_whole("warmup_steps", warmup_steps, allow_zero=True)
         check_positive("epsilon", epsilon, allow_zero=True)
         if not 0 <= hold_until < 1:
@@ -167,8 +161,7 @@ class AdamSettings:
         if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
             raise ValueError(f"betas must be two numbers in [0, 1), got {betas!r}")
         self.decay = Ramp(1.0, final_rate, hold_until, 1.0, kind="exponential")
-        self.warmup_steps, self.epsilon = warmup_steps, epsilon
-        self.orthogonal, self.orthogonal_decay = orthogonal, orthogonal_decay
+        self.warmup_steps, self.epsilon, self.orthogonal = warmup_steps, epsilon, orthogonal
         self.betas = (betas[0], betas[1])
 
     def build(self, model: nn.Module) -> AdamMuon:
@@ -180,8 +173,7 @@ class AdamSettings:
         for group in groups:
             rate = self.learning_rates.get(group.name, self.learning_rates[DEFAULT])
             rates = {"lr": rate, "initial_lr": rate, "weight_decay": self.weight_decays.get(group.name, 0.0)}
-            matrices = {"orthogonal": group.orthogonal and self.orthogonal, "orthogonal_decay": self.orthogonal_decay}
-            listed.append({"params": group.parameters, **rates, **matrices})
+            listed.append({"params": group.parameters, **rates, "orthogonal": group.orthogonal and self.orthogonal})
         return AdamMuon(listed, betas=self.betas, eps=self.epsilon, fused=True)
 
     def factor(self, step: int, progress: float) -> float:

@@ -62,22 +62,6 @@ def test_steps_have_the_size_of_adams() -> None:
     assert 0.6 < root_mean_square / (0.01 * 0.2) < 1.3  # the range of the singular values
 
 
-def test_decay_takes_its_share_of_matrices_and_bounds_them() -> None:
-    """Steps of one size in one direction add up; with a decay d they end where a step is d of what there is."""
-    kept, shrunk = (nn.Parameter(normal(16, 16)) for _ in range(2))
-    plain = AdamMuon([{"params": [kept], "orthogonal": True}], lr=0.1)
-    decayed = AdamMuon([{"params": [shrunk], "orthogonal": True, "orthogonal_decay": 0.5}], lr=0.1)
-    kept.grad = shrunk.grad = -torch.eye(16)
-    plain.step()
-    decayed.step()
-    torch.testing.assert_close(kept.detach() - shrunk.detach(), 0.05 * normal(16, 16))
-    for _ in range(300):
-        shrunk.grad = -torch.eye(16)
-        decayed.step()
-    largest = 1.2 * 0.2 * 16**0.5 / 0.5  # 1.2: the largest singular value of an orthogonalised step
-    assert 0.5 * largest < torch.linalg.matrix_norm(shrunk.detach(), 2) <= largest
-
-
 def test_it_solves_a_badly_scaled_problem_that_holds_adam_up() -> None:
     """Least squares of a matrix whose inputs differ in scale by 10^3: Adam's step per entry follows the rotation."""
     rotation = torch.linalg.qr(normal(32, 32, seed=5))[0]
@@ -149,7 +133,6 @@ def test_rates_rise_are_held_and_fall() -> None:
         (lambda: AdamSettings(betas=(0.9,)), r"betas must be two numbers in \[0, 1\), got \(0.9,\)"),
         (lambda: AdamSettings(betas=(0.9, 1.0)), r"betas must be two numbers in \[0, 1\), got \(0.9, 1.0\)"),
         (lambda: AdamMuon([{"params": [normal(3)], "orthogonal": True}]), r"matrices, got shape \(3,\)"),
-        (lambda: AdamSettings(orthogonal_decay=-1.0), "orthogonal_decay must be"),
         (lambda: moments_of(AdamMuon([{"params": [normal(3)]}]), nn.Parameter(normal(2))), "one of the optimiser's"),
     ],
 )
