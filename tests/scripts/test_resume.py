@@ -13,7 +13,7 @@ from launcher import SMALL_DEMO, Run, run_script
 
 from dnerf.training.tensor_files import decode
 
-SETTINGS = (*SMALL_DEMO, "trainer.callbacks.checkpoints.every=8")
+SETTINGS = ("trainer.callbacks.checkpoints.every=8", *SMALL_DEMO)
 STEPS = 24
 
 
