@@ -51,7 +51,7 @@ def results_page(folder: Path) -> str:
         ]
         if rows:
             plots = [f"{folder.name}/{name}/{PLOT}.png" for name in own if (folder / name / f"{PLOT}.png").is_file()]
-            shown = [f"![Quality against training time]({path})" for path in plots]
+            shown = [f"![Quality against training time]({path})\n" for path in plots]
             parts += [f"## {title}\n", note + "\n", *shown, *markdown_table(rows), "", _commands(own)]
         left = {name: report for name, report in left.items() if name not in own}
     if left:

@@ -77,14 +77,15 @@ def _score(config: DictConfig, run: str, protocol: Protocol | None, lpips: Lpips
     if lpips is not None:
         settings["lpips_backbone"] = config.lpips.backbone
     chunk, name = config.chunk or saved.chunk, f"metrics{suffix}.json"
+    kinds = ErrorKinds(data.frames(split)) if config.kinds else None
     metrics = evaluate_run(
         folder, renderer, data, split, max_frames=config.max_frames, chunk=chunk, settings=settings, name=name,
-        lpips=lpips,
+        lpips=lpips, on_frame=kinds,
     )  # fmt: skip
     print_scores(metrics, folder, name)
     _write_worst(folder, renderer, data.frames(split), metrics, config.worst, chunk)
-    if config.kinds:
-        _print_kinds(renderer, data.frames(split), config.max_frames, chunk)
+    if kinds is not None:
+        print(kinds)
     if config.plots:
         _write_curves(folder / f"curves_{split}.svg", {scene: metrics["frames"]})
     if config.temporal.enabled:
@@ -129,20 +130,23 @@ def _write_worst(
     print(f"worst frames:  {path}")
 
 
-def _print_kinds(renderer: Renderer, frames: Frames, max_frames: int | None, chunk: int) -> None:
-    """Where the error lies, one line a kind."""
-    if not frames.has_alpha:
-        raise ValueError("kinds: silhouettes are those of images with alpha, these have none")
-    found: list[tuple[Tensor, Tensor]] = []
+class ErrorKinds:
+    """Where the error of frames with alpha lies, one line a kind; called with each frame that is scored."""
 
-    def keep(score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
-        alpha = frames.stored_image(score.index)[..., 3].to(truth.device) / 255
-        found.append(((prediction - truth).square().mean(-1), kinds_of(truth, alpha)))
+    def __init__(self, frames: Frames) -> None:
+        if not frames.has_alpha:
+            raise ValueError("kinds: silhouettes are those of images with alpha, these have none")
+        self.frames = frames
+        self.found: list[tuple[Tensor, Tensor]] = []
 
-    evaluate(renderer, frames, chunk=chunk, max_frames=max_frames, on_frame=keep)
-    errors, kinds = (torch.cat([x.flatten() for x in part]) for part in zip(*found, strict=True))
-    for name, (share, pixels) in error_shares(errors, kinds).items():
-        print(f"{name:14} {share:.2f} of the squared error, {pixels:.2f} of the pixels")
+    def __call__(self, score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
+        alpha = self.frames.stored_image(score.index)[..., 3].to(truth.device) / 255
+        self.found.append(((prediction - truth).square().mean(-1).flatten(), kinds_of(truth, alpha).flatten()))
+
+    def __str__(self) -> str:
+        shares = error_shares(*(torch.cat(part) for part in zip(*self.found, strict=True)))
+        lines = (f"{n:14} {x:.2f} of the squared error, {k:.2f} of the pixels" for n, (x, k) in shares.items())
+        return "\n".join(lines)
 
 
 def _write_curves(path: Path, runs: dict[str, Any]) -> None:

@@ -14,6 +14,7 @@ from dnerf.data.background_check import SAME_LEVELS
 from dnerf.data.formats.json_files import read_object
 from dnerf.evaluation import FrameScore, evaluate, scores_by_time, spread_indices
 from dnerf.evaluation.provenance import provenance
+from dnerf.evaluation.scores import FrameCallback
 from dnerf.rendering.renderer import Renderer
 from dnerf.visualization import comparison_sheet, write_png
 
@@ -21,17 +22,10 @@ MAX_ROWS = 4
 
 
 def evaluate_run(
-    folder: Path,
-    renderer: Renderer,
-    data: DataSource,
-    split: str,
-    *,
-    max_frames: int | None = None,
-    chunk: int = 16384,
-    settings: Mapping[str, object] | None = None,
-    name: str = "metrics.json",
-    lpips: Callable[[Tensor, Tensor], float] | None = None,
-) -> dict[str, object]:
+    folder: Path, renderer: Renderer, data: DataSource, split: str, *, max_frames: int | None = None,
+    chunk: int = 16384, settings: Mapping[str, object] | None = None, name: str = "metrics.json",
+    lpips: Callable[[Tensor, Tensor], float] | None = None, on_frame: FrameCallback | None = None,
+) -> dict[str, object]:  # fmt: skip
     """Score a run on a split, or on so many of its frames; write the scores and a contact sheet into its folder.
 
     Args:
@@ -43,7 +37,7 @@ def evaluate_run(
         chunk: rays at a time.
         settings: more facts for the scores' file (scene, protocol, method).
         name: of the scores' file.
-        lpips: see `dnerf.evaluation.evaluate`.
+        lpips, on_frame: see `dnerf.evaluation.evaluate`.
 
     Raises:
         ValueError: if `training.json` is missing or broken.
@@ -56,6 +50,8 @@ def evaluate_run(
     labels: list[str] = []
 
     def keep(score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
+        if on_frame is not None:
+            on_frame(score, prediction, truth)
         if score.index in chosen:
             pairs.append((prediction, truth))
             labels.append(f"t = {score.time:.2f}, {score.psnr:.1f} dB")

@@ -111,8 +111,11 @@ class Frames:
             raise ValueError(f"names must be {num_frames} or none, got {len(self.names)}")
         if self.is_known is not None:
             check_shape("is_known", self.is_known, (self.num_pixels,))
-            if not bool(self.is_known.any()):
-                raise ValueError("is_known must leave pixels that count, got none")
+            counts = [known.any() for i in range(num_frames) if (known := self.known(i)) is not None]
+            empty = (~torch.stack(counts)).nonzero()[:, 0].tolist()
+            if empty:
+                name = self.names[empty[0]] if self.names else empty[0]
+                raise ValueError(f"is_known must leave a pixel of every frame, frame {name} has none: take it out")
         self.camera(0)  # checks the planes
 
     def __len__(self) -> int:
@@ -185,7 +188,7 @@ class Frames:
         return rays, rgba
 
     def counted(self, indices: Tensor) -> Tensor:
-        """Pixels (B,) int64 of which those that do not count give way to others of the same."""
+        """Pixels (B,) int64 of which those that do not count are replaced by others among them, which come again."""
         if self.is_known is None:
             return indices
         known = self.is_known[indices]
@@ -193,15 +196,11 @@ class Frames:
         turns = torch.arange(len(indices), device=indices.device) % known.sum().clamp(min=1)
         return torch.where(known, indices, indices[first[turns]])
 
-    def compared(self, index: int, prediction: Tensor, truth: Tensor) -> Tensor:
-        """A prediction (H, W, 3) of one frame, with the truth (H, W, 3) where pixels do not count."""
+    def known(self, index: int) -> Tensor | None:
+        """Which pixels (H, W) of one frame count; None for all."""
         if self.is_known is None:
-            return prediction
-        return torch.where(self._known_of(index).view(*truth.shape[:2], 1), prediction, truth)
-
-    def _known_of(self, index: int) -> Tensor:
-        assert self.is_known is not None
-        return self.is_known[self.layout.starts[index] : self.layout.starts[index + 1]]
+            return None
+        return self.is_known[self.layout.starts[index] : self.layout.starts[index + 1]].view(self.layout.sizes[index])
 
     def subset(self, indices: Sequence[int]) -> "Frames":
         """The frames with the given indices, in that order (a copy); ValueError for none, or one that is not there."""
@@ -210,10 +209,11 @@ class Frames:
         rows = [i % len(self) for i in indices]
         chosen = torch.as_tensor(rows, device=self.poses.device)
         names = tuple(self.names[i] for i in rows) if self.names else ()
+        known = [part.flatten() for i in rows if (part := self.known(i)) is not None]
         return replace(
             self, images=self._images_of(rows), poses=self.poses[chosen], times=self.times[chosen], names=names,
             intrinsics=tuple(self.intrinsics[i] for i in rows),
-            is_known=None if self.is_known is None else torch.cat([self._known_of(i) for i in rows]),
+            is_known=torch.cat(known) if known else None,
         )  # fmt: skip
 
     def _images_of(self, rows: Sequence[int]) -> Tensor:

@@ -55,8 +55,8 @@ def evaluate(
 ) -> Evaluation:  # fmt: skip
     """Render frames and compare them with the truth on the renderer's own (evaluation) background.
 
-    Images are compared as floats in [0, 1]: predictions clamped, truths as stored in 8 bits. Pixels that do not count
-    are taken as right.
+    Images are compared as floats in [0, 1]: predictions clamped, truths as stored in 8 bits. PSNR is of
+    the pixels that count (`Frames.is_known`); in SSIM and LPIPS the others are as in the truth.
 
     Args:
         max_frames: score at most so many, spread evenly over the split; None scores all.
@@ -75,8 +75,11 @@ def evaluate(
             torch.cuda.synchronize(device)
         seconds.append(time.perf_counter() - begin)
         truth = frames.image(i, background)
-        prediction = frames.compared(i, prediction, truth)
-        score = FrameScore(i, frame_time, min(psnr(prediction, truth), MAX_PSNR), ssim(prediction, truth))
+        known = frames.known(i)
+        if known is not None:
+            prediction = torch.where(known[..., None], prediction, truth)
+        errors = (prediction, truth) if known is None else (prediction[known], truth[known])
+        score = FrameScore(i, frame_time, min(psnr(*errors), MAX_PSNR), ssim(prediction, truth))
         if lpips is not None:
             score = replace(score, lpips=lpips(prediction, truth))
         scores.append(score)

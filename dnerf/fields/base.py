@@ -17,6 +17,7 @@ from dnerf.kernels import FrameTables, GridLevels, MarchGrid
 logger = logging.getLogger(__name__)
 
 MOST_AT_ONCE = 1 << 17  # places that `evaluate_along_rays` evaluates in one go: bounds the memory
+COPIES = 8  # of each number in training: weight, gradient, Adam's moments, what recovery keeps of them, the average
 PAD_TO = 2048  # places: matrix libraries compile code for every new number of rows
 
 
@@ -135,6 +136,11 @@ def field_at_time(field: RadianceField, time: float, extent: Tensor | None = Non
 def warn_of_generic_path(part: str) -> None:
     """Say, once, which part of a model keeps its images from the fused frame kernel."""
     logger.warning("images take the generic path, which is slower: the fused frame kernel does not serve %s", part)
+
+
+def training_gib(count: int) -> float:
+    """Memory that so many learnt numbers of four bytes take in training, in GiB."""
+    return COPIES * 4 * count / 2**30
 
 
 def interval_aware(field: RadianceField) -> IntervalAware | None:

@@ -10,11 +10,10 @@ from torch import Tensor, nn
 from dnerf.core.checks import as_box, check_positive, check_whole
 from dnerf.core.geometry import cubes, in_unit_cube
 from dnerf.deformations.base import check_positions_times
-from dnerf.fields.base import HasRoughness
+from dnerf.fields.base import HasRoughness, training_gib
 from dnerf.kernels import GridLevels, grid_encode
 
 MAX_GIB = 16  # of tables, in training
-BYTES = 16  # of each number: itself, its gradient, two moments
 
 
 class SpaceTimeFeatures(nn.Module, ABC):
@@ -59,7 +58,7 @@ class LatticeFeatures(SpaceTimeFeatures, HasRoughness):
         cells = [[*cubes(corners, r), t] for r, t in zip(resolutions, time_resolutions)]
         self.axes = tuple(tuple(some) for some in axes)
         rows = sum(math.prod(level[k] + 1 for k in some) for level in cells for some in self.axes)
-        gib = BYTES * rows * num_features / 2**30
+        gib = training_gib(rows * num_features)
         if gib > MAX_GIB:
             raise ValueError(
                 f"resolutions {list(resolutions)}, with {max(time_resolutions)} cells of time, need {gib:.0f} GiB in "

@@ -13,12 +13,11 @@ from dnerf.core.schedules import Scheduled
 from dnerf.core.spherical_harmonics import DEGREES, spherical_harmonics
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.activations import activate_density
-from dnerf.fields.base import HasRoughness, RadianceField, TimeDependence
+from dnerf.fields.base import HasRoughness, RadianceField, TimeDependence, training_gib
 from dnerf.fields.head import VIEW_SCALE, open_levels
 from dnerf.kernels import GridLevels, grid_encode
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
-COPIES = 8  # of each number in training: weight, gradient, Adam's moments, what recovery keeps of them, the average
 LAYERS = 16  # of a table that roughness looks at: at all of 256 cells each way, it takes as long as fifty steps
 STRIDE = 7919  # between the first layers of two turns, modulo how many there are: a prime visits them all
 
@@ -79,7 +78,7 @@ class VoxelField(RadianceField, TimeDependence, DeclaresGroups, HasRoughness, Sc
         self.num_viewed = sum(r <= view_resolution for r in resolutions) if view_degree else 0
         self.view_degree = view_degree
         columns = 3 * ((view_degree + 1) ** 2 - 1)
-        gib = COPIES * 4 * (4 * sum(rows) + columns * sum(rows[: self.num_viewed])) / 2**30
+        gib = training_gib(4 * sum(rows) + columns * sum(rows[: self.num_viewed]))
         if gib > max_gib:
             raise ValueError(
                 f"resolutions {list(resolutions)} need {gib:.1f} GiB in training, with gradients, moments "

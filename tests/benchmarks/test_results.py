@@ -56,6 +56,12 @@ def test_page_has_a_row_of_each_result_and_the_command_of_each_report(reports):
         assert f"# {name}: 2026-11-28, commit abc\nmake {name}\n" in page
 
 
+def test_a_plot_of_training_is_shown_above_the_table_and_apart_from_it(reports):
+    assert "training.png" not in results_page(reports)
+    (reports / "quality" / "training.png").touch()
+    assert "![Quality against training time](reports/quality/training.png)\n\n| report |" in results_page(reports)
+
+
 def test_a_film_with_a_report_s_name_is_shown_and_no_other(reports):
     assert "## Films" not in results_page(reports)
     films = reports.parent / "images" / "films"

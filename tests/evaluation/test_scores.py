@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -44,6 +46,21 @@ def test_scores_are_those_of_the_images_on_the_renderers_background(truth):
         assert score.psnr == psnr(prediction, target)
         assert score.ssim == ssim(prediction, target)
         assert score.time == float(frames.times[score.index])
+
+
+def test_scores_leave_out_what_does_not_count(truth):
+    frames, renderer = truth
+    known = torch.ones(5, 16, 16, dtype=torch.bool)
+    known[:, 4:9, 3:12] = False
+    spoilt = frames.images.clone()
+    spoilt[~known] = 255
+    for images in (frames.images, spoilt):
+        scored = evaluate(renderer, replace(frames, images=images, is_known=known.flatten()))
+        image = renderer.render_image(frames.camera(2), float(frames.times[2])).rgb.clamp(0, 1)
+        expected = psnr(image[known[2]], frames.image(2, renderer.plain_background())[known[2]])
+        assert scored.frames[2].psnr == pytest.approx(expected, abs=1e-4)
+        assert scored.ssim > 0.98
+    assert evaluate(renderer, replace(frames, images=spoilt)).psnr < 20
 
 
 def test_identical_images_get_a_finite_score(truth):

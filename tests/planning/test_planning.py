@@ -273,6 +273,12 @@ def test_broken_plans_are_refused_naming_the_file(tmp_path: Path, text: str) -> 
         load_plan(tmp_path / "plan.yaml")
 
 
+def test_held_out_pixels_are_those_that_count() -> None:
+    frames = small_frames(4)
+    known = torch.arange(frames.num_pixels) % 5 > 2
+    assert bool(known[HeldOut.of(replace(frames, is_known=known), 0).indices].all())
+
+
 def test_what_speaks_against_a_given_choice_is_said() -> None:
     class Sees(Evidence):
         def find(self, frames: Frames, box: torch.Tensor) -> Finding:

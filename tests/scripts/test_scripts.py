@@ -48,7 +48,8 @@ def test_training_leaves_a_complete_run_folder(trained):
 
 def test_evaluation_repeats_the_scores_of_training(trained):
     before = json.loads((trained / "run" / "metrics.json").read_text())
-    done = run_script("evaluate", "run=run", "split=test", cwd=trained)
+    done = run_script("evaluate", "run=run", "split=test", "kinds=true", cwd=trained)
+    assert "of the squared error, " in done.stdout
     assert done.returncode == 0, done.stderr
     after = json.loads((trained / "run" / "metrics.json").read_text())
     assert after["frames"] == before["frames"]
@@ -100,13 +101,17 @@ def test_multirun_gives_each_job_its_folder(tmp_path):
     assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 2
 
 
-def test_parts_about_what_a_model_lacks_are_left_as_they_are(tmp_path):
+def test_parts_about_what_a_model_lacks_are_left_as_they_are_and_odd_choices_warned_of(tmp_path):
     lacking = ("field=nerf", "~trainer.losses.appearance_constancy")  # without levels, waves of time or harmonics
-    done = run_script("train", "experiment=auto", *TINY, *lacking, "out_dir=run", cwd=tmp_path)
+    odd = "plan.exposure=drifts"
+    done = run_script("train", "experiment=auto", *TINY, *lacking, odd, "out_dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     plan = load_plan(tmp_path / "run" / "plan.yaml").decisions
     given = {name: decision.choice for name, decision in plan.items() if decision.by == "given"}
+    assert given.pop("exposure") == "drifts"
     assert given == {"detail": "fine", "colors": "many", "view_dependence": "matte", "appearance": "varying"}
+    (warning,) = [line for line in done.stdout.splitlines() if line.startswith("warning: plan.")]
+    assert warning.endswith("stands as set, though the question arises with surroundings=surrounded only")
 
 
 def test_cfg_job_prints_the_config(tmp_path):
