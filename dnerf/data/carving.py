@@ -48,12 +48,14 @@ class Silhouettes:
     distances: Tensor
 
     @classmethod
-    def of(cls, frames: Frames, behind: Tensor | None = None, *, least: int = OPAQUE) -> "Silhouettes":
-        """The silhouettes, of at least so much alpha of 255, of frames with alpha or before a colour (3,) in [0, 1]."""
+    def of(
+        cls, frames: Frames, behind: Tensor | None = None, *, least: int = OPAQUE, unknown: float = 0.0
+    ) -> "Silhouettes":
+        """Of frames with alpha, or before a colour (3,) in [0, 1], with at least so much of 255, see `shown`."""
         block = -(-max(max(size) for size in frames.layout.sizes) // NUM_BLOCKS)
         order = frames.times.argsort(stable=True)
         rows = order.tolist()
-        blocks = [max_pool2d(shown(frames, i, behind)[None], block, ceil_mode=True) for i in rows]
+        blocks = [max_pool2d(shown(frames, i, behind, unknown)[None], block, ceil_mode=True) for i in rows]
         sizes = [each.shape[1:] for each in blocks]
         height, width = (max(size[axis] for size in sizes) for axis in (0, 1))
         blocks = [pad(each, (0, width - each.shape[2], 0, height - each.shape[1])) for each in blocks]
@@ -187,11 +189,13 @@ def opaque_rays(frames: Frames, index: int, behind: Tensor | None = None) -> Ray
     return frames.camera(index).rays(0.0, EVERY_PIXEL * (rows * levels.shape[1] + columns))
 
 
-def shown(frames: Frames, index: int, behind: Tensor | None) -> Tensor:
+def shown(frames: Frames, index: int, behind: Tensor | None, unknown: float = 0.0) -> Tensor:
     """How much of something each pixel shows, (H, W) float32 in [0, 255]: its alpha, or with a colour (3,) in [0, 1]
-    behind opaque images, the largest difference from it. What has that colour itself needs no density."""
-    image = frames.stored_image(index).float()
-    return image[..., 3] if behind is None else (image[..., :3] - 255 * behind.to(image)).abs().amax(-1)
+    behind opaque images, the largest difference from it. What has that colour itself needs no density. `unknown` is for
+    pixels that do not count."""
+    image, known = frames.stored_image(index).float(), frames.known(index)
+    levels = image[..., 3] if behind is None else (image[..., :3] - 255 * behind.to(image)).abs().amax(-1)
+    return levels if known is None else torch.where(known, levels, unknown)
 
 
 def _dilated(blocks: Tensor) -> Tensor:

@@ -48,14 +48,9 @@ class Finding:
 
 @torch.no_grad()
 def check_consistency(
-    renderer: Renderer,
-    rays: Rays,
-    box: Sequence[Sequence[float]] | Tensor | None,
-    *,
-    slabs: int = 1,
-    truth: Images | None = None,
-    train_times: Sequence[float] = (),
-) -> list[Finding]:
+    renderer: Renderer, rays: Rays, box: Sequence[Sequence[float]] | Tensor | None, *, slabs: int = 1,
+    truth: Images | None = None, train_times: Sequence[float] = (),
+) -> list[Finding]:  # fmt: skip
     """All checks that a model allows.
 
     Args:

@@ -13,6 +13,7 @@ from dnerf.data.frames import Frames
 from dnerf.evaluation.images import psnr, ssim
 from dnerf.rendering.renderer import Renderer
 
+GREY = 0.5  # of what does not count, on both sides
 MAX_PSNR = 100.0
 
 
@@ -56,7 +57,7 @@ def evaluate(
     """Render frames and compare them with the truth on the renderer's own (evaluation) background.
 
     Images are compared as floats in [0, 1]: predictions clamped, truths as stored in 8 bits. PSNR is of
-    the pixels that count (`Frames.is_known`); in SSIM and LPIPS the others are as in the truth.
+    the pixels that count (`Frames.is_known`); in SSIM, LPIPS and what is shown the others are grey.
 
     Args:
         max_frames: score at most so many, spread evenly over the split; None scores all.
@@ -77,7 +78,7 @@ def evaluate(
         truth = frames.image(i, background)
         known = frames.known(i)
         if known is not None:
-            prediction = torch.where(known[..., None], prediction, truth)
+            prediction, truth = (torch.where(known[..., None], image, GREY) for image in (prediction, truth))
         errors = (prediction, truth) if known is None else (prediction[known], truth[known])
         score = FrameScore(i, frame_time, min(psnr(*errors), MAX_PSNR), ssim(prediction, truth))
         if lpips is not None:

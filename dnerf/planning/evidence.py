@@ -134,5 +134,5 @@ def unexplained_share(frames: Frames, box: torch.Tensor) -> float:
         return 0.0
     steps = (torch.arange(NUM_DISTANCES, device=kept.device) + 0.5) / NUM_DISTANCES
     distances = enter[kept, None] + (leave - enter)[kept, None] * steps
-    seen = Silhouettes.of(views, least=NOT_CLEAR).share_of_views(rays[kept], distances, REACH)
+    seen = Silhouettes.of(views, least=NOT_CLEAR, unknown=255.0).share_of_views(rays[kept], distances, REACH)
     return float((seen.amax(1) < AGREEMENT).float().mean())

@@ -254,33 +254,30 @@ def bad_pose(**entries: float) -> Tensor:
     return poses
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"images": torch.zeros(3, 4, 6, 4, dtype=torch.uint8)}, "images must have shape"),
-        ({"images": torch.zeros(3, 4, 5, 2, dtype=torch.uint8)}, "images must have shape"),
-        ({"images": torch.zeros(0, 4, 5, 4, dtype=torch.uint8)}, "images must have shape"),
-        ({"images": torch.zeros(3, 4, 5, 4)}, "images must be torch.uint8"),
-        ({"images": torch.zeros(3, 4, 4, 5, dtype=torch.uint8).mT}, "images must be contiguous"),
-        ({"poses": torch.eye(4)}, "poses must have shape"),
-        ({"poses": torch.eye(4, dtype=torch.float64).expand(3, 4, 4)}, "poses must be torch.float32"),
-        ({"poses": bad_pose(_00=math.nan)}, "pose 1 is not"),
-        ({"poses": bad_pose(_03=math.inf)}, "pose 1 is not"),
-        ({"times": torch.zeros(3, 1)}, "times must have shape"),
-        ({"times": torch.tensor([0, 0.5, 1.001])}, "times must be in"),
-        ({"times": torch.tensor([-0.001, 0.5, 1])}, "times must be in"),
-        ({"times": torch.tensor([0, math.nan, 1])}, "times must be in"),
-        ({"near": 6.0, "far": 2.0}, "near and far"),
-        ({"background": "white"}, "background must be None"),
-        ({"names": ("a",)}, "names must be 3"),
-        ({"intrinsics": (INTRINSICS,) * 2}, "intrinsics must be one, or 3 as there are times, got 2"),
-        (
-            {"intrinsics": (INTRINSICS, INTRINSICS, Intrinsics(4, 4, 6.0, 7.0))},
-            r"images must have shape \(56, 3 or 4\)",
-        ),
-        ({"channels": 3, "background": "pink"}, "color must be"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"images": torch.zeros(3, 4, 6, 4, dtype=torch.uint8)}, "images must have shape"),
+    ({"images": torch.zeros(3, 4, 5, 2, dtype=torch.uint8)}, "images must have shape"),
+    ({"images": torch.zeros(0, 4, 5, 4, dtype=torch.uint8)}, "images must have shape"),
+    ({"images": torch.zeros(3, 4, 5, 4)}, "images must be torch.uint8"),
+    ({"images": torch.zeros(3, 4, 4, 5, dtype=torch.uint8).mT}, "images must be contiguous"),
+    ({"poses": torch.eye(4)}, "poses must have shape"),
+    ({"poses": torch.eye(4, dtype=torch.float64).expand(3, 4, 4)}, "poses must be torch.float32"),
+    ({"poses": bad_pose(_00=math.nan)}, "pose 1 is not"),
+    ({"poses": bad_pose(_03=math.inf)}, "pose 1 is not"),
+    ({"times": torch.zeros(3, 1)}, "times must have shape"),
+    ({"times": torch.tensor([0, 0.5, 1.001])}, "times must be in"),
+    ({"times": torch.tensor([-0.001, 0.5, 1])}, "times must be in"),
+    ({"times": torch.tensor([0, math.nan, 1])}, "times must be in"),
+    ({"near": 6.0, "far": 2.0}, "near and far"),
+    ({"background": "white"}, "background must be None"),
+    ({"names": ("a",)}, "names must be 3"),
+    ({"intrinsics": (INTRINSICS,) * 2}, "intrinsics must be one, or 3 as there are times, got 2"),
+    (
+        {"intrinsics": (INTRINSICS, INTRINSICS, Intrinsics(4, 4, 6.0, 7.0))},
+        r"images must have shape \(56, 3 or 4\)",
+    ),
+    ({"channels": 3, "background": "pink"}, "color must be"),
+])  # fmt: skip
 def test_what_does_not_fit_is_refused(changes: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_frames(**changes)

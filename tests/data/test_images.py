@@ -243,22 +243,19 @@ def test_masks_are_averaged_to_their_images_and_of_other_shapes_refused(tmp_path
     assert read_mask(colored, (2, 1)).tolist() == [[200, 51]]
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (png(30_000, 30_000), "30000 x 30000|exceeds limit"),
-        (png(100_000, 1), "at most 33554432 pixels and 16384 on a side, got 100000 x 1"),
-        (png(8000, 8000), "at most 33554432 pixels and 16384 on a side, got 8000 x 8000"),
-        (png(0, 0), "image"),
-        (b"", "image must be a PNG or JPEG file; it is empty: copy or export it again"),
-        (b"<!DOCTYPE html>", "image must be a PNG or JPEG file; it is a web page"),
-        (b"\0\0\0\x18ftypheic", "image must be a PNG or JPEG file; it is HEIC"),
-        (b"\x89PNG\r\n\x1a\n", "image"),
-        (b"not an image at all, although it is long enough", "image must be a PNG or JPEG file"),
-        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 3\n", "image must be a PNG or JPEG file"),
-        (b"GIF89a\x04\x00\x03\x00\x00\x00\x00", "image must be a PNG or JPEG file"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (png(30_000, 30_000), "30000 x 30000|exceeds limit"),
+    (png(100_000, 1), "at most 33554432 pixels and 16384 on a side, got 100000 x 1"),
+    (png(8000, 8000), "at most 33554432 pixels and 16384 on a side, got 8000 x 8000"),
+    (png(0, 0), "image"),
+    (b"", "image must be a PNG or JPEG file; it is empty: copy or export it again"),
+    (b"<!DOCTYPE html>", "image must be a PNG or JPEG file; it is a web page"),
+    (b"\0\0\0\x18ftypheic", "image must be a PNG or JPEG file; it is HEIC"),
+    (b"\x89PNG\r\n\x1a\n", "image"),
+    (b"not an image at all, although it is long enough", "image must be a PNG or JPEG file"),
+    (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 3\n", "image must be a PNG or JPEG file"),
+    (b"GIF89a\x04\x00\x03\x00\x00\x00\x00", "image must be a PNG or JPEG file"),
+])  # fmt: skip
 def test_what_is_no_sensible_image_is_refused_by_its_header(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)

@@ -73,19 +73,16 @@ def test_a_power_of_two_without_a_shift_changes_no_bit_of_a_mantissa(power) -> N
     assert (there == IDENTITY) == (power == 0)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Similarity(0.0), "scale must be positive"),
-        (lambda: Similarity(math.nan), "scale must be positive"),
-        (lambda: Similarity(rotation=((1.0, 0, 0), (0, 1.0, 0), (0, 0, 2.0))), "rotation must be orthonormal"),
-        (lambda: Similarity(rotation=((1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0))), "rotation must be orthonormal"),
-        (lambda: Similarity(center=(math.inf, 0, 0)), "center must be three finite"),
-        (lambda: Similarity.of_box([[0.0] * 3, [0.0] * 3]), "low < high"),
-        (lambda: upright((0, 0, 0)), "up must be a direction"),
-        (lambda: Clock(0.0, 0.0), "length positive"),
-    ],
-)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: Similarity(0.0), "scale must be positive"),
+    (lambda: Similarity(math.nan), "scale must be positive"),
+    (lambda: Similarity(rotation=((1.0, 0, 0), (0, 1.0, 0), (0, 0, 2.0))), "rotation must be orthonormal"),
+    (lambda: Similarity(rotation=((1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0))), "rotation must be orthonormal"),
+    (lambda: Similarity(center=(math.inf, 0, 0)), "center must be three finite"),
+    (lambda: Similarity.of_box([[0.0] * 3, [0.0] * 3]), "low < high"),
+    (lambda: upright((0, 0, 0)), "up must be a direction"),
+    (lambda: Clock(0.0, 0.0), "length positive"),
+])  # fmt: skip
 def test_what_is_no_similarity_or_clock_is_refused(make, message) -> None:
     with pytest.raises(ValueError, match=message):
         make()

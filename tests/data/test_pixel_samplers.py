@@ -205,17 +205,14 @@ def test_rays_that_were_not_rendered_change_nothing() -> None:
     assert pixels.errors[0, 1, 1] == UNKNOWN
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: TemporalCurriculum(origin=1.5), r"origin must be in \[0, 1\], got 1.5"),
-        (lambda: TemporalCurriculum(0.0), "end must be > 0"),
-        (lambda: TemporalCurriculum(start=2.0), r"start must be in \(0, 1\], got 2.0"),
-        (lambda: guided(frames(), -0.1), r"share must be in \[0, 1\], got -0.1"),
-        (lambda: guided(frames(), resolution=0), "resolution must be > 0"),
-        (lambda: guided(frames(), memory=1.0), r"memory must be in \[0, 1\), got 1.0"),
-    ],
-)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: TemporalCurriculum(origin=1.5), r"origin must be in \[0, 1\], got 1.5"),
+    (lambda: TemporalCurriculum(0.0), "end must be > 0"),
+    (lambda: TemporalCurriculum(start=2.0), r"start must be in \(0, 1\], got 2.0"),
+    (lambda: guided(frames(), -0.1), r"share must be in \[0, 1\], got -0.1"),
+    (lambda: guided(frames(), resolution=0), "resolution must be > 0"),
+    (lambda: guided(frames(), memory=1.0), r"memory must be in \[0, 1\), got 1.0"),
+])  # fmt: skip
 def test_numbers_out_of_range_are_refused(make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()

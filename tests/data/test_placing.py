@@ -61,16 +61,13 @@ def move(root: Path, scale: float, turn: torch.Tensor = IDENTITY, shift: tuple[f
     edit_frames(root, change)
 
 
-@pytest.mark.parametrize(
-    ("scale", "turn", "shift"),
-    [
-        (1e-3, IDENTITY, (0.0, 0.0, 0.0)),
-        (0.4, IDENTITY, (12.0, -7.0, 3.0)),
-        (50.0, Y_UP, (0.0, 0.0, 0.0)),
-        (1e3, Y_UP, (4e5, -5e6, 120.0)),
-        (2.0, TILTED, (1.0, 2.0, 3.0)),
-    ],
-)
+@pytest.mark.parametrize(("scale", "turn", "shift"), [
+    (1e-3, IDENTITY, (0.0, 0.0, 0.0)),
+    (0.4, IDENTITY, (12.0, -7.0, 3.0)),
+    (50.0, Y_UP, (0.0, 0.0, 0.0)),
+    (1e3, Y_UP, (4e5, -5e6, 120.0)),
+    (2.0, TILTED, (1.0, 2.0, 3.0)),
+])  # fmt: skip
 def test_units_origin_and_up_do_not_change_what_is_learnt(
     plain: Path, root: Path, scale: float, turn: torch.Tensor, shift: tuple[float, ...]
 ) -> None:
@@ -128,18 +125,15 @@ def test_given_planes_and_box_are_in_the_data_s_units(root: Path) -> None:
     assert (frames.near, frames.far) == pytest.approx((90 * 2.5 / 180, 310 * 2.5 / 180))
 
 
-@pytest.mark.parametrize(
-    ("scale", "settings", "said"),
-    [
-        (
-            0.4,
-            {"near": 1.5},
-            r"data.near=1.5 cuts off what the images show, which begins at about (1\.\d+|0\.9\d*): set",
-        ),
-        (1.0, {"far": 4.2}, r"data.far=4.2 cuts off"),
-        (1.0, {"box": [[-0.3] * 3, [0.3] * 3]}, r"% of the opaque pixels look past data.box.*set data.box=\[\["),
-    ],
-)
+@pytest.mark.parametrize(("scale", "settings", "said"), [
+    (
+        0.4,
+        {"near": 1.5},
+        r"data.near=1.5 cuts off what the images show, which begins at about (1\.\d+|0\.9\d*): set",
+    ),
+    (1.0, {"far": 4.2}, r"data.far=4.2 cuts off"),
+    (1.0, {"box": [[-0.3] * 3, [0.3] * 3]}, r"% of the opaque pixels look past data.box.*set data.box=\[\["),
+])  # fmt: skip
 def test_settings_that_cut_off_what_images_show_are_told_with_a_value(root, scale, settings, said) -> None:
     move(root, scale)
     (warning,) = FolderData(root, **settings).world().warnings

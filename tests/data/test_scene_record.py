@@ -43,25 +43,22 @@ def test_a_record_comes_back_bit_for_bit(tmp_path) -> None:
         back.split("val")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda value: value.update(version=99), "version must be 1"),
-        (lambda value: value.pop("world"), "world"),
-        (lambda value: value["cameras"].pop("train"), "train split"),
-        (lambda value: value["world"].update(box=[[0, 0, 0], [0, 0, 0]]), "low < high"),
-        (lambda value: value["world"]["similarity"].update(scale=-1), "scale must be positive"),
-        (lambda value: value["world"]["similarity"].update(scale="1"), "scale must be finite numbers"),
-        (lambda value: value["world"]["clock"].update(length=0), "length positive"),
-        (lambda value: value["world"].update(planes=[1]), "planes|values"),
-        (lambda value: value["cameras"]["train"].update(times=[0.0] * 4), "times must have shape"),
-        (lambda value: value["cameras"]["train"].update(times=[2.0] * 5), r"times must be in \[0, 1\]"),
-        (lambda value: value["cameras"]["train"].update(intrinsics_indices=[9] * 5), "must name intrinsics"),
-        (lambda value: value["cameras"]["train"]["intrinsics"][0].update(width=1.5), "width must be a whole"),
-        (lambda value: value["cameras"]["train"]["intrinsics"][0].update(other=1), "other"),
-        (lambda value: value["cameras"]["train"]["poses"][0].reverse(), "rigid"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda value: value.update(version=99), "version must be 1"),
+    (lambda value: value.pop("world"), "world"),
+    (lambda value: value["cameras"].pop("train"), "train split"),
+    (lambda value: value["world"].update(box=[[0, 0, 0], [0, 0, 0]]), "low < high"),
+    (lambda value: value["world"]["similarity"].update(scale=-1), "scale must be positive"),
+    (lambda value: value["world"]["similarity"].update(scale="1"), "scale must be finite numbers"),
+    (lambda value: value["world"]["clock"].update(length=0), "length positive"),
+    (lambda value: value["world"].update(planes=[1]), "planes|values"),
+    (lambda value: value["cameras"]["train"].update(times=[0.0] * 4), "times must have shape"),
+    (lambda value: value["cameras"]["train"].update(times=[2.0] * 5), r"times must be in \[0, 1\]"),
+    (lambda value: value["cameras"]["train"].update(intrinsics_indices=[9] * 5), "must name intrinsics"),
+    (lambda value: value["cameras"]["train"]["intrinsics"][0].update(width=1.5), "width must be a whole"),
+    (lambda value: value["cameras"]["train"]["intrinsics"][0].update(other=1), "other"),
+    (lambda value: value["cameras"]["train"]["poses"][0].reverse(), "rigid"),
+])  # fmt: skip
 def test_a_changed_record_is_refused_in_one_line(tmp_path, change, message) -> None:
     record().write(tmp_path)
     value = json.loads((tmp_path / SCENE).read_text())

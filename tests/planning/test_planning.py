@@ -14,6 +14,7 @@ from small_runs import small_frames, small_renderer, small_trainer, weights
 from dnerf.core.backgrounds import RandomBackground
 from dnerf.core.cameras import Intrinsics, look_at
 from dnerf.data import Frames, SyntheticData
+from dnerf.data.bounds import fit_box
 from dnerf.fields import GridField
 from dnerf.planning import Decision, Evidence, Finding, Part, Plan, make_plan
 from dnerf.planning.evidence import ColorsEvidence, DetailEvidence, MotionEvidence, SurroundingsEvidence, mixture_share
@@ -44,6 +45,23 @@ def test_silhouettes_of_a_body_at_rest_leave_it_at_rest_until_a_trial() -> None:
     finding = MotionEvidence().find(frames_of("static"), BOX)
     assert finding is not None
     assert (finding.choice, finding.is_certain) == ("still", False)
+
+
+def test_ignored_pixels_hardly_change_the_box_and_do_not_pass_for_motion() -> None:
+    frames = frames_of("static", 40)
+    images, known = frames.images.clone(), torch.ones(40, 64, 64, dtype=torch.bool)
+    for i in range(40):
+        row, column = (37 * i) % 44, (53 * i) % 44
+        images[i, row : row + 12, column : column + 12] = 255
+        known[i, row : row + 12, column : column + 12] = False
+    spoilt = replace(frames, images=images)
+    masked = replace(spoilt, is_known=known.flatten())
+    (motion, clean), (found, box) = ((MotionEvidence().find(x, fit_box(x)), fit_box(x)) for x in (frames, masked))
+    assert motion is not None
+    assert found is not None
+    assert (found.choice, motion.choice) == ("still", "still")
+    assert (box - clean).abs().max() < 0.3  # larger: fewer views carve
+    assert (fit_box(spoilt) - clean).abs().max() > 0.9
 
 
 def test_frames_of_one_time_are_still_for_certain_and_opaque_ones_tell_nothing() -> None:

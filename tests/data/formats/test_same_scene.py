@@ -38,13 +38,10 @@ def assert_the_scene(frames: list[CaptureFrame]) -> None:
             np.testing.assert_allclose(rays.origins[pixel].numpy(), pose[:3, 3], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "write"),
-    [
-        *((name, write) for name, write in WRITERS.items() if name != "rig"),
-        ("colmap", partial(data_folders.write_colmap, binary=False)),
-    ],
-)
+@pytest.mark.parametrize(("name", "write"), [
+    *((name, write) for name, write in WRITERS.items() if name != "rig"),
+    ("colmap", partial(data_folders.write_colmap, binary=False)),
+])  # fmt: skip
 def test_every_format_gives_the_same_cameras_times_and_images(tmp_path: Path, name: str, write: partial) -> None:
     capture = read_capture(write(tmp_path / "scene"))
     assert capture.format == name

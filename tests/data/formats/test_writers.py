@@ -56,13 +56,10 @@ def test_what_is_written_is_read_back_exactly(
 
 
 @pytest.mark.parametrize("save", [save_blender, save_transforms])
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"intrinsics": Intrinsics(8, 6, 7.1, 8.3, 3.9, 3.3, "corner"), "near": 0.1, "far": 1e3},
-        {"channels": 3, "background": (1.0, 0.5, 0.25)},
-    ],
-)
+@pytest.mark.parametrize("changes", [
+    {"intrinsics": Intrinsics(8, 6, 7.1, 8.3, 3.9, 3.3, "corner"), "near": 0.1, "far": 1e3},
+    {"channels": 3, "background": (1.0, 0.5, 0.25)},
+])  # fmt: skip
 def test_extra_fields_survive_in_every_split(tmp_path: Path, save: Callable, changes: dict[str, Any]) -> None:
     frames, others = random_frames(**changes), random_frames(2, seed=1, **changes)
     save({"train": frames, "test": others}, tmp_path / "scene")
@@ -73,15 +70,12 @@ def test_extra_fields_survive_in_every_split(tmp_path: Path, save: Callable, cha
 LENS = Distortion("opencv", (0.1, -0.01), (0.001, 0.002))
 
 
-@pytest.mark.parametrize(
-    "lenses",
-    [
-        [LENS] * 3,
-        [LENS, None, Distortion("opencv", (0.0, 0.02))],
-        [Distortion("opencv", (0.1, 0.0, 0.0, 0.05)), None, None],
-        [Distortion("fisheye", (0.1,)), Distortion("fisheye", (0.0, 0.02, 0.0, 0.01)), Distortion("fisheye", (0.03,))],
-    ],
-)
+@pytest.mark.parametrize("lenses", [
+    [LENS] * 3,
+    [LENS, None, Distortion("opencv", (0.0, 0.02))],
+    [Distortion("opencv", (0.1, 0.0, 0.0, 0.05)), None, None],
+    [Distortion("fisheye", (0.1,)), Distortion("fisheye", (0.0, 0.02, 0.0, 0.01)), Distortion("fisheye", (0.03,))],
+])  # fmt: skip
 def test_nerfstudios_format_keeps_cameras_and_lenses_of_their_own(
     tmp_path: Path, lenses: list[Distortion | None]
 ) -> None:
