@@ -246,6 +246,8 @@ def _known(headers: Sequence[_Header]) -> Tensor | None:
             mask = read_mask(header.frame.mask, header.size)
             kept = torch.from_numpy(premultiplied_area_average(mask[..., None], width, height)[..., 0])
         parts.append(kept.flatten() >= KEPT)
+        if not bool(parts[-1].any()):
+            raise ValueError(f"{header.frame.mask}: mask must leave a pixel of its image, got none: take its frame out")
     return torch.cat(parts)
 
 

@@ -168,6 +168,9 @@ def test_ignored_pixels_are_those_that_a_mask_does_not_keep_whole_and_images_sta
     assert halved is not None
     assert (~halved).nonzero().tolist() == [[1]]
     assert load_frames([one, other], masks="ignored").is_known is None
+    Image.fromarray(0 * levels).save(tmp_path / "mask.png")
+    with pytest.raises(ValueError, match=r"mask\.png: mask must leave a pixel of its image"):
+        load_frames([masked, other], masks="ignored")
 
 
 def test_frames_of_videos_are_theirs_in_any_order_beside_images(tmp_path: Path) -> None:
