@@ -17,6 +17,7 @@ from dnerf.core.rays import Rays, Samples
 from dnerf.core.schedules import Scheduled
 from dnerf.core.shortcuts import speaks_for
 from dnerf.fields.base import RadianceField, evaluate_samples, interval_aware
+from dnerf.kernels import has_bfloat16
 from dnerf.rendering.exposure import Exposure
 from dnerf.rendering.frame_graphs import FrameGraphs
 from dnerf.rendering.image import image_columns
@@ -41,8 +42,8 @@ class Renderer(nn.Module):
         quadrature: how density between samples is read, "constant", "linear" or "parabolic": see
             `dnerf.core.quadrature`.
         graphs: on a GPU, replay whole images as CUDA graphs; for samplers of `FixedCapacity`.
-        precision: "float32", or "bfloat16" to run networks under autocast; positions, encodings and compositing stay
-            float32 either way.
+        precision: "float32", or "bfloat16" to run networks under autocast where the processor has instructions for it;
+            positions, encodings and compositing stay float32 either way.
         stop_transmittance: whole images end a ray of packed samples once so little light is left, which changes
             colours by at most as much, and by as much again for each interval that a sampler which subdivides leaves
             out since its weight is as small; 0 to evaluate the field everywhere. Without effect on other quadratures
@@ -149,9 +150,9 @@ class Renderer(nn.Module):
             self.sampler.update(self.field, step)
 
     def autocast(self, device: torch.device) -> torch.autocast:
-        """A context in which networks run in the renderer's precision on a device."""
+        """A context in which networks run in the renderer's precision on a device, in float32 if it has no other."""
         dtype = PRECISIONS[self.precision]
-        return torch.autocast(device.type, dtype=dtype, enabled=dtype is not None)
+        return torch.autocast(device.type, dtype=dtype, enabled=dtype is not None and has_bfloat16(device.type))
 
     def set_progress(self, progress: float) -> None:
         """Tell every part of which something follows training where it stands, in [0, 1], see `Scheduled`."""

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from dnerf.core.checks import check_mapping, check_positive, check_whole
 from dnerf.core.schedules import Ramp
+from dnerf.kernels import has_bfloat16
 from dnerf.nn.parameter_groups import DEFAULT, collect_groups
 
 logger = logging.getLogger(__name__)
@@ -32,7 +33,8 @@ def orthogonalized(matrices: Tensor) -> Tensor:
     a, b, c = QUINTIC
     tiny = torch.finfo(matrices.dtype).tiny
     x = matrices / matrices.abs().amax((-2, -1), keepdim=True).clamp(min=tiny)  # squares of small entries underflow
-    x = (x / torch.linalg.matrix_norm(x, keepdim=True).clamp(min=tiny)).bfloat16()
+    x = x / torch.linalg.matrix_norm(x, keepdim=True).clamp(min=tiny)
+    x = x.bfloat16() if has_bfloat16(x.device.type) else x
     for _ in range(ROUNDS):
         gram = x @ x.mT
         x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
