@@ -15,16 +15,10 @@ Row = dict[str, Any]
 
 @torch.no_grad()
 def endpoint_rows(
-    model: MotionModel,
-    scene: AnalyticScene,
-    *,
-    time: float = 0.0,
-    times: Sequence[float] = (0.1, 0.25, 0.5, 0.75, 1.0),
-    num_points: int = 4096,
-    depth: float = 0.05,
-    min_motion: float = 0.01,
-    seed: int = 0,
-) -> list[Row]:
+    model: MotionModel, scene: AnalyticScene, *, time: float = 0.0,
+    times: Sequence[float] = (0.1, 0.25, 0.5, 0.75, 1.0), num_points: int = 4096, depth: float = 0.05,
+    min_motion: float = 0.01, seed: int = 0,
+) -> list[Row]:  # fmt: skip
     """3-D end-point error of recovered motion: distance from where the scene carries a point.
 
     Points lie near the surface of exactly one body at both times (joints overlap, and there motion has no single

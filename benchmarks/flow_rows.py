@@ -45,14 +45,9 @@ def smooth_network() -> NetworkVelocity:
 
 
 def solver_rows(
-    fields: Sequence[str] = (*CLOSED_FLOWS, "network"),
-    *,
-    num_points: int = 4096,
-    steps: Sequence[int] = STEPS,
-    tolerances: Sequence[float] = TOLERANCES,
-    repeats: int = 3,
-    device: str = "cpu",
-) -> list[Row]:
+    fields: Sequence[str] = (*CLOSED_FLOWS, "network"), *, num_points: int = 4096, steps: Sequence[int] = STEPS,
+    tolerances: Sequence[float] = TOLERANCES, repeats: int = 3, device: str = "cpu",
+) -> list[Row]:  # fmt: skip
     """Error of every solver against its function evaluations and milliseconds, in float64.
 
     Points in [-1, 1]^3 at random times in [0, 1] are carried to time 0. The truth is the closed form, or for
@@ -151,13 +146,9 @@ def variants() -> dict[str, Deformation]:
 
 
 def variant_rows(
-    names: Sequence[str] = (),
-    *,
-    num_samples: int = 24576,
-    repeats: int = 10,
-    precision: torch.dtype | None = torch.bfloat16,
-    device: str = "cpu",
-) -> list[Row]:
+    names: Sequence[str] = (), *, num_samples: int = 24576, repeats: int = 10,
+    precision: torch.dtype | None = torch.bfloat16, device: str = "cpu",
+) -> list[Row]:  # fmt: skip
     """Milliseconds of every variant for the samples of one training step, beside the displacement network's.
 
     Samples lie near the surface of an ellipsoid, grouped in rays, each ray with the time of one of the frames.

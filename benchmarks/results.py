@@ -1,14 +1,15 @@
 """One page of all results, from the reports that suites have written."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from benchmarks.kernel_cases import COMPILED, PLAIN, REFERENCE
 from benchmarks.report import markdown_table
-from benchmarks.suite import Row
-from benchmarks.training import PLOT
+from benchmarks.suite import Plot, Row
+from benchmarks.training import quality_plot
 
 HEAD = """# Results
 
@@ -18,6 +19,8 @@ Compare times within one report only: machines, and hours of one machine, differ
 A dash is what a report does not say; a dagger after a commit points to a note beside the command.
 """
 
+QUALITY = "means_over_seeds"  # table of suite=training
+PLOT = "images/quality.png"
 FILMS = "images/films"  # beside the reports' folder: a film has its report's name
 FILMS_NOTE = """Each is of a run of the report of that name, by
 `python scripts/render.py run=... path=orbit num_frames=40 fps=10 resolution=180 format=gif`.
@@ -34,9 +37,7 @@ def results_page(folder: Path) -> str:
     Raises:
         ValueError: for a folder without reports, or naming a file that is none.
     """
-    reports = {path.parent.name: _read(path) for path in sorted(folder.glob("*/results.json"))}
-    if not reports:
-        raise ValueError(f"reports must be a folder with */results.json, found none in {folder}")
+    reports = _reports(folder)
     parts = [HEAD.format(folder=f"[{folder.name}/]({folder.name}/)")]
     films = [name for name in reports if (folder.parent / FILMS / f"{name}.gif").is_file()]
     if films:
@@ -50,14 +51,36 @@ def results_page(folder: Path) -> str:
             for row in rows_of(report["tables"][table])
         ]
         if rows:
-            plots = [f"{folder.name}/{name}/{PLOT}.png" for name in own if (folder / name / f"{PLOT}.png").is_file()]
-            shown = [f"![Quality against training time]({path})\n" for path in plots]
+            has_plot = table == QUALITY and (folder.parent / PLOT).is_file()
+            shown = [f"![PSNR against seconds]({PLOT})\n"] if has_plot else []
             parts += [f"## {title}\n", note + "\n", *shown, *markdown_table(rows), "", _commands(own)]
         left = {name: report for name, report in left.items() if name not in own}
     if left:
         rows = [{"report": _link(folder, name), "what": report["title"]} for name, report in left.items()]
         parts += ["## Other reports\n", *markdown_table(rows), "", _commands(left)]
     return "\n".join(parts)
+
+
+def plot_of_all(folder: Path) -> Plot | None:
+    """PSNR against seconds of training on CPUs, of all experiments of which reports at 400 x 400 have several budgets.
+
+    Of two reports of the same, the later one counts. None if there is nothing to show; ValueError as `results_page`.
+    """
+    rows = {}
+    for report in sorted(_reports(folder).values(), key=lambda report: report["date"]):
+        for row in report["tables"].get(QUALITY, []):
+            if row.get("resolution") == 400 and "NVIDIA" not in report["machine"]["hardware"]:
+                rows[row["scene"], row["experiment"], row["budget_s"]] = row
+    counts = Counter(key[:2] for key in rows)
+    shown = [rows[key] for key in sorted(rows) if counts[key[:2]] > 1]
+    return quality_plot(shown) if shown else None
+
+
+def _reports(folder: Path) -> dict[str, dict[str, Any]]:
+    reports = {path.parent.name: _read(path) for path in sorted(folder.glob("*/results.json"))}
+    if not reports:
+        raise ValueError(f"reports must be a folder with */results.json, found none in {folder}")
+    return reports
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -132,20 +155,13 @@ def _kernels(rows: list[Row]) -> Iterator[Row]:
         }
 
 
+QUALITY_NOTE = """Held-out frames; with several seeds their mean and, in brackets, worst and best. `model MiB` is the
+size of the weights file. D-NeRF's Lego is scored on `val`: its test split shows another pose than its train split."""
+FRAMES_NOTE = "Each frame alone, in evaluation mode: median and quartiles of the time."
+KERNELS_NOTE = "The compiled version, and how many times as long its definition and the best plain torch take."
 SECTIONS: tuple[tuple[str, str, str, Callable[[list[Row]], Iterator[Row]]], ...] = (
-    (
-        "Quality after seconds of training",
-        "means_over_seeds",
-        "Held-out frames; with several seeds their mean and, in brackets, worst and best. `model MiB` is the size of "
-        "the weights file. D-NeRF's Lego is scored on `val`: its test split shows another pose than its train split.",
-        _quality,
-    ),
-    ("Frames", "frames", "Each frame alone, in evaluation mode: median and quartiles of the time.", _frames),
-    (
-        "Kernels",
-        "times",
-        "The compiled version, and how many times as long its definition and the best plain torch take.",
-        _kernels,
-    ),
+    ("Quality after seconds of training", QUALITY, QUALITY_NOTE, _quality),
+    ("Frames", "frames", FRAMES_NOTE, _frames),
+    ("Kernels", "times", KERNELS_NOTE, _kernels),
 )
 """Title, table of the reports, note, and what is taken from that table."""

@@ -9,7 +9,6 @@ from benchmarks.scenes import scene_overrides
 from benchmarks.suite import Plot, Series, Settings, SuiteResult, Table
 
 QUICK = {"scenes": ["walker"], "seconds": [1, 3], "seeds": [0], "resolution": 40, "experiments": ["fast"]}
-PLOT = "training"
 STYLES = ("line", "dashed", "points")
 VARIED = ("scenes", "experiments", "seconds", "seeds")
 
@@ -45,7 +44,7 @@ def run(settings: Settings) -> SuiteResult:
             Table("Means over seeds", means, "psnr_low, psnr_high: worst and best seed. frames: how many were scored."),
             Table("Runs", rows),
         ],
-        plots=[_plot(means)] if len(options["seconds"]) > 1 else [],
+        plots=[quality_plot(means)] if len(options["seconds"]) > 1 else [],
         findings=_findings(means),
     )
 
@@ -92,7 +91,8 @@ def _mean_row(scene: str, experiment: str, seconds: float, runs: list[Run], opti
     }
 
 
-def _plot(rows: list[dict[str, Any]]) -> Plot:
+def quality_plot(rows: list[dict[str, Any]]) -> Plot:
+    """PSNR against seconds of training, a line for each scene and experiment."""
     series, scenes = [], list(dict.fromkeys(row["scene"] for row in rows))
     for number, experiment in enumerate(dict.fromkeys(row["experiment"] for row in rows)):
         for color, scene in enumerate(scenes):
@@ -101,7 +101,7 @@ def _plot(rows: list[dict[str, Any]]) -> Plot:
             style = STYLES[number % len(STYLES)]
             series.append(Series(f"{scene}, {experiment}", x, y, low, high, style=style, color=color))
     return Plot(
-        name=PLOT,
+        name="training",
         title="Quality against training time",
         x_label="seconds of training",
         y_label="PSNR of held-out frames (dB)",

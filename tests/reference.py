@@ -68,11 +68,9 @@ def invert_histogram(edges: Sequence[float], weights: Sequence[float], u: float)
     return edges[-1]
 
 
-def sinusoidal(
-    values: Sequence[float], num_frequencies: int, include_input: bool, window: Sequence[float]
-) -> list[float]:
+def sinusoidal(values: Sequence[float], num_frequencies: int, window: Sequence[float]) -> list[float]:
     """The sinusoidal encoding of one vector: itself, then every octave's sines, then every octave's cosines."""
-    encoded = list(values) if include_input else []
+    encoded = list(values)
     for wave in (math.sin, math.cos):
         for k in range(num_frequencies):
             encoded += [window[k] * wave(2**k * value) for value in values]

@@ -18,7 +18,7 @@ from .trace_network import FrameTables, is_traced, trace_network
 
 __all__ = [
     "BACKENDS", "Footprints", "FrameTables", "GridLevels", "MarchGrid", "MarchedSamples", "SeenParts", "add_seen",
-    "footprints", "get_backend", "grid_encode", "grid_network", "has_bfloat16", "is_bfloat16_wanted", "is_traced", "march",
-    "march_to_size", "packed_sum", "packed_weights", "relu_layers", "seen_parts", "series_sums",
+    "footprints", "get_backend", "grid_encode", "grid_network", "has_bfloat16", "is_bfloat16_wanted", "is_traced",
+    "march", "march_to_size", "packed_sum", "packed_weights", "relu_layers", "seen_parts", "series_sums",
     "set_backend", "shade", "skip_distances", "trace_network", "use_backend",
 ]  # fmt: skip

@@ -31,25 +31,21 @@ class SinusoidalEncoding(nn.Module, Scheduled):
     Args:
         num_dims: D, size of the last axis of the input.
         num_frequencies: number of octaves, >= 0.
-        include_input: whether the value itself comes first.
         window_end: fraction of the training, in (0, 1], at which every frequency is fully in; None for no window.
 
     Raises:
-        ValueError: for an encoding of size zero or a window outside (0, 1].
+        ValueError: for no dimensions or a window outside (0, 1].
     """
 
-    def __init__(
-        self, num_dims: int, num_frequencies: int, include_input: bool = True, *, window_end: float | None = None
-    ) -> None:
+    def __init__(self, num_dims: int, num_frequencies: int, *, window_end: float | None = None) -> None:
         super().__init__()
         check_positive("num_dims", num_dims)
-        check_positive("num_frequencies", num_frequencies, allow_zero=include_input)
+        check_positive("num_frequencies", num_frequencies, allow_zero=True)
         check_within("window_end", window_end, "(0, 1]", or_none=True)
         self.num_dims = num_dims
         self.num_frequencies = num_frequencies
-        self.include_input = include_input
         self.window_end = window_end
-        self.out_features = num_dims * (2 * num_frequencies + include_input)
+        self.out_features = num_dims * (2 * num_frequencies + 1)
         self.frequencies = nn.Buffer(2.0 ** torch.arange(num_frequencies), persistent=False)
         weights = torch.zeros(num_frequencies) if window_end is not None else torch.ones(num_frequencies)
         self.window = nn.Buffer(weights, persistent=window_end is not None)
@@ -63,7 +59,7 @@ class SinusoidalEncoding(nn.Module, Scheduled):
         self.window.copy_(0.5 * (1 - torch.cos(math.pi * (alpha - octaves).clamp(0, 1))))
 
     def forward(self, values: Tensor) -> Tensor:
-        """Encode (..., D) -> (..., D * (2 * num_frequencies + include_input)), in the input's dtype."""
+        """Encode (..., D) -> (..., D * (2 * num_frequencies + 1)), in the input's dtype."""
         return torch.cat(self.parts(values), dim=-1)
 
     def parts(self, values: Tensor) -> list[Tensor]:
@@ -74,7 +70,7 @@ class SinusoidalEncoding(nn.Module, Scheduled):
         if self.window_end is not None:
             window = self.window.to(values.dtype).repeat_interleave(self.num_dims)
             waves = [wave * window for wave in waves]
-        return [values, *waves] if self.include_input else waves
+        return [values, *waves]
 
 
 class TimeEncoding(nn.Module, FrameTimesAware):

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from benchmarks import SuiteResult, Table, write_report
-from benchmarks.results import results_page
+from benchmarks.results import plot_of_all, results_page
 
 pytest.importorskip("matplotlib")
 
@@ -24,10 +24,10 @@ KERNEL = {
 }  # fmt: skip
 
 
-def write(folder, name, table, rows):
+def write(folder, name, table, rows, date="2026-11-28 10:00 UTC"):
     result = SuiteResult(f"The {name}", "", [Table("Rows", rows, name=table)])
     machine = {"hardware": "2 x CPU", "commit": "abc"}
-    write_report(result, folder / name, command=f"make {name}", machine=machine, date="2026-11-28 10:00 UTC, in 9 s")
+    write_report(result, folder / name, command=f"make {name}", machine=machine, date=f"{date}, in 9 s")
 
 
 @pytest.fixture
@@ -56,10 +56,16 @@ def test_page_has_a_row_of_each_result_and_the_command_of_each_report(reports):
         assert f"# {name}: 2026-11-28, commit abc\nmake {name}\n" in page
 
 
-def test_a_plot_of_training_is_shown_above_the_table_and_apart_from_it(reports):
-    assert "training.png" not in results_page(reports)
-    (reports / "quality" / "training.png").touch()
-    assert "![Quality against training time](reports/quality/training.png)\n\n| report |" in results_page(reports)
+def test_one_plot_has_what_has_several_budgets_and_stands_above_the_table(reports):
+    assert plot_of_all(reports) is None
+    later = [{**QUALITY, **x} for x in ({"psnr": 35.0}, {"budget_s": 300, "psnr": 37.0}, {"resolution": 96})]
+    write(reports, "a_later_one", "means_over_seeds", later, date="2026-11-29 10:00 UTC")
+    (series,) = plot_of_all(reports).series
+    assert (series.label, series.x, series.y) == ("mutant, fast", [60, 300], [35.0, 37.0])
+    assert "quality.png" not in results_page(reports)
+    (reports.parent / "images").mkdir()
+    (reports.parent / "images" / "quality.png").touch()
+    assert "![PSNR against seconds](images/quality.png)\n\n| report |" in results_page(reports)
 
 
 def test_a_film_with_a_report_s_name_is_shown_and_no_other(reports):

@@ -163,21 +163,18 @@ def test_splits_without_images_have_cameras_and_no_frames(folder, tmp_path):
         FolderData(root, hold_out=None).check("test")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"near": -1.0}, "near must be >= 0"),
-        ({"near": 3.0, "far": 2.0}, "near must be less than far"),
-        ({"hold_out": 0}, "hold_out must be > 0"),
-        ({"times": "now"}, "times must be one of auto, order, static"),
-        ({"axes": "left"}, "axes must be one of"),
-        ({"format": "none"}, "format must be one of"),
-        ({"pixel_origin": "left"}, "pixel_origin must be one of"),
-        ({"resolution": 9}, "resolution must be at most the images' width 8"),
-        ({"box": [[9.0, 9, 9], [10, 10, 10]]}, "box must be seen by some camera|box lies elsewhere"),
-        ({"near": 50.0}, "near must be less than far, got 50"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"near": -1.0}, "near must be >= 0"),
+    ({"near": 3.0, "far": 2.0}, "near must be less than far"),
+    ({"hold_out": 0}, "hold_out must be > 0"),
+    ({"times": "now"}, "times must be one of auto, order, static"),
+    ({"axes": "left"}, "axes must be one of"),
+    ({"format": "none"}, "format must be one of"),
+    ({"pixel_origin": "left"}, "pixel_origin must be one of"),
+    ({"resolution": 9}, "resolution must be at most the images' width 8"),
+    ({"box": [[9.0, 9, 9], [10, 10, 10]]}, "box must be seen by some camera|box lies elsewhere"),
+    ({"near": 50.0}, "near must be less than far, got 50"),
+])  # fmt: skip
 def test_settings_that_make_no_sense_are_refused(folder, arguments, message):
     with pytest.raises(ValueError, match=message):
         FolderData(folder, **arguments).frames("train")

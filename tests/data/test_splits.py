@@ -68,14 +68,11 @@ def test_frames_without_times_are_static_or_numbered_as_asked() -> None:
     assert any("one time" in note for note in split_frames(capture(train=frames([7.0] * 3))).notes)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (capture(train=frames([0.0, None])), "frame r_1 has none; set data.times=order or data.times=static"),
-        (capture(train=frames([0.0, 1.0], image=False)), "there must be training frames with images"),
-        (capture(test=frames([0.0])), "there must be training frames with images"),
-    ],
-)
+@pytest.mark.parametrize(("given", "message"), [
+    (capture(train=frames([0.0, None])), "frame r_1 has none; set data.times=order or data.times=static"),
+    (capture(train=frames([0.0, 1.0], image=False)), "there must be training frames with images"),
+    (capture(test=frames([0.0])), "there must be training frames with images"),
+])  # fmt: skip
 def test_what_cannot_be_divided_or_timed_is_refused(given, message) -> None:
     with pytest.raises(ValueError, match=message):
         split_frames(given)

@@ -114,18 +114,15 @@ def arc(count: int, degrees: float) -> Tensor:
     return torch.stack([look_at((4 * math.cos(a), 4 * math.sin(a), 1.0)) for a in angles]).double()
 
 
-@pytest.mark.parametrize(
-    ("poses", "said"),
-    [
-        (around(1), "one training image"),
-        (around(1).expand(12, 4, 4), "one camera that stands still"),
-        (arc(2, 30).repeat(6, 1, 1), "two viewpoints"),
-        (arc(4, 60).repeat(6, 1, 1), "4 viewpoints on one side"),
-        (arc(4, 270).repeat(6, 1, 1), None),
-        (arc(30, 60), None),
-        (around(), None),
-    ],
-)
+@pytest.mark.parametrize(("poses", "said"), [
+    (around(1), "one training image"),
+    (around(1).expand(12, 4, 4), "one camera that stands still"),
+    (arc(2, 30).repeat(6, 1, 1), "two viewpoints"),
+    (arc(4, 60).repeat(6, 1, 1), "4 viewpoints on one side"),
+    (arc(4, 270).repeat(6, 1, 1), None),
+    (arc(30, 60), None),
+    (around(), None),
+])  # fmt: skip
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e3])
 def test_what_cannot_be_determined_is_said_in_any_units(poses, said, scale) -> None:
     own = views(moved(poses, scale=scale, shift=(0.0, 0.0, 0.0)))

@@ -56,16 +56,13 @@ def test_hidden_points_do_not_count() -> None:
     assert track_errors(tracks, truth, visible, image_size=512).accuracy == pytest.approx(4 / 5)
 
 
-@pytest.mark.parametrize(
-    ("measure", "shapes", "message"),
-    [
-        (track_errors, [(1, 2, 3), (1, 2, 3)], "tracks must have shape"),
-        (track_errors, [(2, 2, 3), (2, 3, 3)], "truth must have shape"),
-        (track_errors, [(2, 2, 2), (2, 2, 2)], "image_size must be given"),
-        (end_point_error, [(2, 2), (2, 3)], "motion and truth must have one shape"),
-        (end_point_error, [(2, 2), (2, 2), (3,)], "mask must have shape"),
-    ],
-)
+@pytest.mark.parametrize(("measure", "shapes", "message"), [
+    (track_errors, [(1, 2, 3), (1, 2, 3)], "tracks must have shape"),
+    (track_errors, [(2, 2, 3), (2, 3, 3)], "truth must have shape"),
+    (track_errors, [(2, 2, 2), (2, 2, 2)], "image_size must be given"),
+    (end_point_error, [(2, 2), (2, 3)], "motion and truth must have one shape"),
+    (end_point_error, [(2, 2), (2, 2), (3,)], "mask must have shape"),
+])  # fmt: skip
 def test_what_cannot_be_compared_is_named(measure: Callable, shapes: list[tuple[int, ...]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         measure(*(torch.zeros(shape) for shape in shapes))

@@ -138,18 +138,15 @@ def test_exact_vectors_explain_true_images_and_others_do_not() -> None:
     assert wrong_depths[1] > 1.2 * depths[1]
 
 
-@pytest.mark.parametrize(
-    ("measure", "shapes", "message"),
-    [
-        (warping_error, [(7, 9, 3), (7, 9, 3), (3, 9, 2), (7, 9)], r"flow must have shape \(7, 9, 2\)"),
-        (warping_error, [(7, 9, 3), (3, 9, 3), (7, 9, 2), (7, 9)], "visible must be bool, got torch.float32"),
-        (depth_consistency, [(7, 9, 3), (7, 9), (7, 9, 2), (7, 9)], "first_depth must have shape"),
-        (flicker, [(2, 4, 4, 3)], "frames must be at least 3, got 2"),
-        (temporal_psnr, [(1, 4, 4, 3), (1, 4, 4, 3)], "frames must be at least 2, got 1"),
-        (temporal_psnr, [(2, 4, 4, 3), (3, 4, 4, 3)], "truths must have shape"),
-        (sample_image, [(7, 9, 3), (4, 3)], r"pixels must have shape \(..., 2\)"),
-    ],
-)
+@pytest.mark.parametrize(("measure", "shapes", "message"), [
+    (warping_error, [(7, 9, 3), (7, 9, 3), (3, 9, 2), (7, 9)], r"flow must have shape \(7, 9, 2\)"),
+    (warping_error, [(7, 9, 3), (3, 9, 3), (7, 9, 2), (7, 9)], "visible must be bool, got torch.float32"),
+    (depth_consistency, [(7, 9, 3), (7, 9), (7, 9, 2), (7, 9)], "first_depth must have shape"),
+    (flicker, [(2, 4, 4, 3)], "frames must be at least 3, got 2"),
+    (temporal_psnr, [(1, 4, 4, 3), (1, 4, 4, 3)], "frames must be at least 2, got 1"),
+    (temporal_psnr, [(2, 4, 4, 3), (3, 4, 4, 3)], "truths must have shape"),
+    (sample_image, [(7, 9, 3), (4, 3)], r"pixels must have shape \(..., 2\)"),
+])  # fmt: skip
 def test_what_does_not_fit_is_named(measure: Callable, shapes: list[tuple[int, ...]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         measure(*(torch.zeros(shape) for shape in shapes))

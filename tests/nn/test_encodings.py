@@ -11,14 +11,12 @@ from dnerf.nn.encodings import SinusoidalEncoding, TimeEncoding
 
 
 @pytest.mark.parametrize("num_dims", [1, 3])
-@pytest.mark.parametrize(
-    ("num_frequencies", "include_input"), [(0, True), (1, True), (10, True), (1, False), (10, False)]
-)
-def test_sinusoidal_encoding_agrees_with_a_loop(num_dims: int, num_frequencies: int, include_input: bool) -> None:
-    encoding = SinusoidalEncoding(num_dims, num_frequencies, include_input)
+@pytest.mark.parametrize("num_frequencies", [0, 1, 10])
+def test_sinusoidal_encoding_agrees_with_a_loop(num_dims: int, num_frequencies: int) -> None:
+    encoding = SinusoidalEncoding(num_dims, num_frequencies)
     values = 2 * torch.randn(20, num_dims, dtype=torch.float64)
     encoded = encoding(values)
-    expected = [sinusoidal(row, num_frequencies, include_input, [1.0] * num_frequencies) for row in values.tolist()]
+    expected = [sinusoidal(row, num_frequencies, [1.0] * num_frequencies) for row in values.tolist()]
     assert encoded.dtype == torch.float64
     assert encoded.shape == (20, encoding.out_features)
     torch.testing.assert_close(encoded, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-15)
@@ -31,7 +29,7 @@ def test_window_opens_octave_by_octave(progress: float) -> None:
     alpha = 4 * min(progress / 0.5, 1)
     window = [(1 - math.cos(math.pi * min(max(alpha - k, 0), 1))) / 2 for k in range(4)]
     values = torch.randn(5, 2, dtype=torch.float64)
-    expected = torch.tensor([sinusoidal(row, 4, True, window) for row in values.tolist()], dtype=torch.float64)
+    expected = torch.tensor([sinusoidal(row, 4, window) for row in values.tolist()], dtype=torch.float64)
     # The window is kept in float32.
     torch.testing.assert_close(encoding(values), expected, rtol=0, atol=1e-6)
 
@@ -167,7 +165,6 @@ def test_gradcheck_of_sinusoidal_encoding() -> None:
 @pytest.mark.parametrize(("arguments", "message"), [
     ({"num_dims": 0, "num_frequencies": 4}, "num_dims must be > 0"),
     ({"num_dims": 3, "num_frequencies": -1}, "num_frequencies must be >= 0"),
-    ({"num_dims": 3, "num_frequencies": 0, "include_input": False}, "num_frequencies must be > 0"),
     ({"num_dims": 3, "num_frequencies": 4, "window_end": 0.0}, "window_end must be in"),
     ({"num_dims": 3, "num_frequencies": 4, "window_end": 1.1}, "window_end must be in"),
     ({"num_dims": 3, "num_frequencies": 4, "window_end": math.nan}, "window_end must be in"),
