@@ -1,6 +1,7 @@
 """Layers of a ReLU network, one after the other."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import torch
@@ -56,8 +57,11 @@ def is_bfloat16_wanted(inputs: Tensor) -> bool:
     return has_bfloat16(device) and torch.get_autocast_dtype(device) == torch.bfloat16
 
 
+@cache
 def has_bfloat16(device: str) -> bool:
-    """Whether a type of device multiplies in bfloat16; CPUs that do not take ten times as long as in float32."""
+    """Whether a type of device multiplies in bfloat16; to emulate it takes many times as long as float32."""
+    if device == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
     return device != "cpu" or (torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
