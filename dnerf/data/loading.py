@@ -70,13 +70,9 @@ _Wanted = dict[int, list[tuple[_Header, Tensor]]]  # by frame of a video
 
 
 def load_frames(
-    frames: Sequence[CaptureFrame],
-    *,
-    resolution: int | None = None,
-    has_alpha: bool | None = None,
-    masks: str = "empty",
-    max_memory: int = MAX_MEMORY,
-) -> LoadedFrames:
+    frames: Sequence[CaptureFrame], *, resolution: int | None = None, has_alpha: bool | None = None,
+    masks: str = "empty", max_memory: int = MAX_MEMORY,
+) -> LoadedFrames:  # fmt: skip
     """Decode the images of frames, with their masks as alpha, and reduce them to a width.
 
     Images are decoded, premultiplied, averaged over pixel areas and rounded one at a time in each of up to four

@@ -1,5 +1,6 @@
 """Layers of a ReLU network, one after the other."""
 
+import logging
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -9,6 +10,8 @@ from torch import Tensor
 
 from .backend import choose, run_compiled
 from .op import op
+
+logger = logging.getLogger(__name__)
 
 # oneDNN's ReLU makes zeros of NaNs; with a slope below zero, however small, it keeps them.
 SLOPE = 1e-30
@@ -61,8 +64,13 @@ def is_bfloat16_wanted(inputs: Tensor) -> bool:
 def has_bfloat16(device: str) -> bool:
     """Whether a type of device multiplies in bfloat16; to emulate it takes many times as long as float32."""
     if device == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    return device != "cpu" or (torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported())
+        found = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        has_onednn = torch.backends.mkldnn.is_available()
+        found = device != "cpu" or bool(has_onednn and torch.ops.mkldnn._is_mkldnn_bf16_supported())
+    if not found:
+        logger.info("this processor has no instructions for bfloat16: all is computed in float32, which is slower")
+    return found
 
 
 def _run(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, is_kept: bool) -> list[Tensor]:

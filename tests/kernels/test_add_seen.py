@@ -86,16 +86,13 @@ def test_hard_densities(backend: str) -> None:
     assert torch.equal(sums[others], a["sums"][others])
 
 
-@pytest.mark.parametrize(
-    ("name", "wrong", "message"),
-    [
-        *((name, slice(1, None), f"{name} must have shape") for name in ("light", "density", "ends", "offsets")),
-        *((name, (slice(None), slice(2)), f"{name} must have shape") for name in ("sums", "rgb")),
-        ("offsets", torch.tensor([0, 2, 5]), "offsets must run from 0 to 4, got 0 to 5"),
-        ("rays", torch.tensor([1, 5]), r"rays must lie in \[0, 5\), got 1 to 5"),
-        ("distances", torch.zeros(3), "distances must have shape"),
-    ],
-)
+@pytest.mark.parametrize(("name", "wrong", "message"), [
+    *((name, slice(1, None), f"{name} must have shape") for name in ("light", "density", "ends", "offsets")),
+    *((name, (slice(None), slice(2)), f"{name} must have shape") for name in ("sums", "rgb")),
+    ("offsets", torch.tensor([0, 2, 5]), "offsets must run from 0 to 4, got 0 to 5"),
+    ("rays", torch.tensor([1, 5]), r"rays must lie in \[0, 5\), got 1 to 5"),
+    ("distances", torch.zeros(3), "distances must have shape"),
+])  # fmt: skip
 def test_wrong_arguments_are_named(name: str, wrong: object, message: str) -> None:
     a = rounds([2, 2])
     value = wrong if isinstance(wrong, Tensor) else a[name][wrong]

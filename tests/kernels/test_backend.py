@@ -31,15 +31,12 @@ def test_context_manager_restores_the_backend_after_an_error():
     assert [*during, kernels.get_backend()] == ["reference", before]
 
 
-@pytest.mark.parametrize(
-    ("tensor", "expected"),
-    [
-        (torch.zeros(1), "numba"),
-        (torch.zeros(1, dtype=torch.float64), "numba"),
-        (torch.zeros(1, dtype=torch.bfloat16), "reference"),
-        (torch.zeros(1, device="meta"), "reference"),
-    ],
-)
+@pytest.mark.parametrize(("tensor", "expected"), [
+    (torch.zeros(1), "numba"),
+    (torch.zeros(1, dtype=torch.float64), "numba"),
+    (torch.zeros(1, dtype=torch.bfloat16), "reference"),
+    (torch.zeros(1, device="meta"), "reference"),
+])  # fmt: skip
 def test_auto_chooses_by_device_and_dtype(tensor, expected):
     assert under("auto", backend.choose, tensor) == expected
 

@@ -6,12 +6,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dnerf.kernels import relu_layers, use_backend
+from dnerf.kernels import has_bfloat16, relu_layers, use_backend
 from dnerf.kernels.cpu.dense import has_vectors, is_supported
 from dnerf.kernels.relu_layers import relu_layers_reference
 
-has_bfloat16 = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-fused = pytest.mark.skipif(not has_bfloat16, reason="this CPU has no products in bfloat16")
+fused = pytest.mark.skipif(not has_bfloat16("cpu"), reason="this CPU has no products in bfloat16")
 vectors = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
 
 
@@ -155,3 +154,12 @@ def test_layers_that_do_not_fit_are_refused(shapes: tuple[tuple[int, int], ...],
 def test_code_for_another_processor_does_without_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("numba.config.CPU_NAME", "generic")
     assert not has_vectors.__wrapped__()
+
+
+def test_a_processor_without_bfloat16_is_told_of_once(monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    has_bfloat16.cache_clear()
+    with caplog.at_level("INFO"):
+        assert [has_bfloat16("cpu"), has_bfloat16("cpu")] == [False, False]
+    has_bfloat16.cache_clear()
+    assert len(caplog.records) == 1
