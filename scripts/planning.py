@@ -44,7 +44,7 @@ def given_choices(config: DictConfig, parts: Mapping[str, Part], frames: Frames,
         every = (override for overrides in part.candidates.values() for override in overrides)
         fits = all(_has(config, _key(override)) for override in every if override[0] not in "+~")
         if name not in choices and (is_said or not fits):
-            choices[name] = next((first[override] for override in said if override in first), part.default)
+            choices[name] = next((first[override] for override in said if override in first), part.unchanged)
     return choices
 
 

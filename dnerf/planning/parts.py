@@ -35,6 +35,8 @@ class Part:
         self.candidates = {name: tuple(overrides) for name, overrides in candidates.items()}
         self.only_if = dict(only_if or {})
         self.simplest = next(iter(self.candidates))
+        # What a model has that none of the candidates' settings fit.
+        self.unchanged = next((name for name, overrides in self.candidates.items() if not overrides), default)
 
     def arises(self, choices: Mapping[str, str]) -> bool:
         """Whether the choices made so far leave the question open."""

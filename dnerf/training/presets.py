@@ -41,12 +41,9 @@ def load_dataset(path: str | Path, split: str = "train", resolution: int | None 
 
 
 def make_renderer(
-    box: Corners,
-    *,
-    deformation: Deformation | None = None,
-    field: RadianceField | None = None,
+    box: Corners, *, deformation: Deformation | None = None, field: RadianceField | None = None,
     background: Background | None = None,
-) -> Renderer:
+) -> Renderer:  # fmt: skip
     """The model of `experiment=fast`: a small displacement network into a multi-resolution grid.
 
     Args:
