@@ -37,11 +37,8 @@ class Given:
 
 
 def place(
-    make_frames: FrameMaker,
-    poses: Tensor,
-    intrinsics: Sequence[Intrinsics],
-    given: Given,
-) -> World:
+    make_frames: FrameMaker, poses: Tensor, intrinsics: Sequence[Intrinsics], given: Given,
+) -> World:  # fmt: skip
     """Place training frames in the world.
 
     Up is z, the fitted or given box stands at the origin with a longest side of 2.5. Everything is computed from

@@ -10,13 +10,9 @@ from .backend import run_compiled
 
 
 def op(
-    schema: str,
-    kernel: str,
-    *,
-    backward: Callable[..., Any] | None = None,
-    setup_context: Callable[..., None] | None = None,
-    gradient_of: str | None = None,
-) -> Callable[..., Any]:
+    schema: str, kernel: str, *, backward: Callable[..., Any] | None = None,
+    setup_context: Callable[..., None] | None = None, gradient_of: str | None = None,
+) -> Callable[..., Any]:  # fmt: skip
     """An operation of `torch.ops.dnerf` that returns new tensors and changes none of its arguments.
 
     What `torch.library.custom_op` makes does the same, but loads all of `torch.compile`, most of a second, when it is

@@ -17,6 +17,7 @@ class Part:
         at: progress of training, in (0, 1), at which candidates are tried against each other, from the same weights.
         evidence: looks at the images before training; None where they cannot be enough.
         only_if: choices of earlier parts, by their names, without which the question does not arise.
+        first: the one with which a model takes its first steps, and stays where these are all; the default if None.
 
     Raises:
         ValueError: for fewer than two candidates, an unknown default, or a progress out of range.
@@ -24,11 +25,13 @@ class Part:
 
     def __init__(
         self, question: str, candidates: Mapping[str, Sequence[str]], default: str, *, at: float = 0.1,
-        evidence: Evidence | None = None, only_if: Mapping[str, str] | None = None,
+        evidence: Evidence | None = None, only_if: Mapping[str, str] | None = None, first: str | None = None,
     ) -> None:  # fmt: skip
         if len(candidates) < 2:
             raise ValueError(f"candidates must be at least two, got {list(candidates)}")
-        check_choice("default", default, tuple(candidates))
+        self.first = default if first is None else first
+        for name, choice in (("default", default), ("first", self.first)):
+            check_choice(name, choice, tuple(candidates))
         if not 0 < at < 1:
             raise ValueError(f"at must be in (0, 1), got {at}")
         self.question, self.default, self.at, self.evidence = question, default, at, evidence

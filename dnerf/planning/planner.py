@@ -139,19 +139,32 @@ class _Planner:
 
     def _untried(self, name: str, why: str) -> Decision:
         standing = self.standing[name]
-        by = "images" if standing.why else "default"
-        return Decision(standing.choice, by, f"{standing.why}; {why}" if standing.why else why)
+        if standing.why:
+            return Decision(standing.choice, "images", f"{standing.why}; {why}")
+        part, is_first = self.parts[name], self.leading is not None and self.leading.run.step < LEAST_DONE
+        return Decision(part.first if is_first else part.default, "default", why)
 
     def _leading(self, learnt: Frames, choices: Mapping[str, str], at: float) -> Contender:
-        """The model decided so far, trained until a progress."""
+        """The model decided so far, trained until a progress; its first steps are those of parts' first candidates."""
+        undecided = {n: p for n, p in self.parts.items() if n not in self.decisions and choices[n] == p.default}
+        first = {**choices, **{name: part.first for name, part in undecided.items()}}
         if self.leading is None:
-            self.leading = Contender.fresh("", self.make, choices, learnt, self.seed)
+            self.leading = Contender.fresh("", self.make, first, learnt, self.seed)
             self.leading.run.callbacks = self.callbacks
             for callback in self.callbacks.values():
                 callback.on_train_begin(self.leading.run)
-        run, limits = self.leading.run, self.leading.trainer.limits
-        self.leading.trainer.advance(run, lambda: limits.progress(run.step, run.seconds) >= at)
+        if self.leading.run.step < LEAST_DONE:
+            self._advance(self.leading, at, LEAST_DONE)
+            if first != choices and self.leading.run.step >= LEAST_DONE:
+                callbacks = self.leading.run.callbacks
+                self.leading = self.leading.forked("", self.make, choices, learnt, self.seed)
+                self.leading.run.callbacks = callbacks
+        self._advance(self.leading, at)
         return self.leading
+
+    def _advance(self, leading: Contender, at: float, step: float = math.inf) -> None:
+        run, limits = leading.run, leading.trainer.limits
+        leading.trainer.advance(run, lambda: run.step >= step or limits.progress(run.step, run.seconds) >= at)
 
     def _effort(self, leading: Contender, num_others: int, num_left: int) -> Effort:
         """What each candidate may spend for the budget's share to suffice."""

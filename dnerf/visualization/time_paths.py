@@ -10,12 +10,9 @@ ROUNDING = 1e-6  # of the clock, beyond either end of what there is
 
 
 def film_times(
-    num_frames: int,
-    time: str | float,
-    limits: Sequence[float] = (0.0, 1.0),
-    limits_clock: Clock | None = None,
+    num_frames: int, time: str | float, limits: Sequence[float] = (0.0, 1.0), limits_clock: Clock | None = None,
     clock: Clock | None = None,
-) -> list[float]:
+) -> list[float]:  # fmt: skip
     """Times of a film in [0, 1].
 
     Args:

@@ -47,13 +47,9 @@ def to_uint8(images: Tensor | NDArray) -> Tensor:
 
 
 def write_frames(
-    images: Iterable[Tensor | NDArray],
-    path: str | Path,
-    format: str | None = None,
-    *,
-    fps: float = 30.0,
+    images: Iterable[Tensor | NDArray], path: str | Path, format: str | None = None, *, fps: float = 30.0,
     quality: float = 8.0,
-) -> Path:
+) -> Path:  # fmt: skip
     """Write images as one MP4 or GIF, or as a folder of `frame_00000.png`, ...; returns the path.
 
     - mp4: H.264 in yuv420p, tagged as BT.709 (primaries, transfer, matrix), which every player shows. It needs even

@@ -32,13 +32,9 @@ class View:
 
 
 def make_views(
-    poses: Tensor,
-    times: Sequence[float],
-    intrinsics: Intrinsics | Sequence[Intrinsics],
-    planes: Sequence[tuple[float, float]],
-    *,
-    have_truth: bool = False,
-) -> list[View]:
+    poses: Tensor, times: Sequence[float], intrinsics: Intrinsics | Sequence[Intrinsics],
+    planes: Sequence[tuple[float, float]], *, have_truth: bool = False,
+) -> list[View]:  # fmt: skip
     """Views of a path.
 
     Args:

@@ -33,16 +33,13 @@ def test_small_arguments_keep_their_digits():
     np.testing.assert_allclose(values(x)[1], np.expm1(x.astype(np.float64)), rtol=2 * np.finfo(np.float32).eps)
 
 
-@pytest.mark.parametrize(
-    ("x", "expected"),
-    [
-        (0.0, (1, 0, 0.5)),
-        (-0.0, (1, 0, 0.5)),
-        (-1e30, (math.exp(-87), -1, math.exp(-88))),
-        (-math.inf, (math.exp(-87), -1, math.exp(-88))),
-        (math.inf, (math.exp(88), math.exp(88), 1)),
-    ],
-)
+@pytest.mark.parametrize(("x", "expected"), [
+    (0.0, (1, 0, 0.5)),
+    (-0.0, (1, 0, 0.5)),
+    (-1e30, (math.exp(-87), -1, math.exp(-88))),
+    (-math.inf, (math.exp(-87), -1, math.exp(-88))),
+    (math.inf, (math.exp(88), math.exp(88), 1)),
+])  # fmt: skip
 def test_ends_of_the_range(x, expected):
     np.testing.assert_allclose(values(np.array([x], np.float32))[:, 0], expected, rtol=1e-6)
 

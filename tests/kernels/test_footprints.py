@@ -94,15 +94,12 @@ def test_cells_beside_and_behind(backend: str) -> None:
     assert seen(occupancy, camera_at((0.6, 0.2, 0.1)), backend) is None  # in a face
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"occupancy": torch.ones(2, 2) > 0}, r"occupancy must be bool of shape \(Gx"),
-        ({"occupancy": torch.ones(2, 2, 2)}, "occupancy must be bool"),
-        ({"pose": torch.eye(4)[:3]}, "pose must have shape"),
-        ({"lens": (1.0, 1.0)}, "lens must be four numbers"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"occupancy": torch.ones(2, 2) > 0}, r"occupancy must be bool of shape \(Gx"),
+    ({"occupancy": torch.ones(2, 2, 2)}, "occupancy must be bool"),
+    ({"pose": torch.eye(4)[:3]}, "pose must have shape"),
+    ({"lens": (1.0, 1.0)}, "lens must be four numbers"),
+])  # fmt: skip
 def test_what_does_not_fit_is_refused(change: dict, message: str) -> None:
     arguments = {"occupancy": torch.ones(2, 2, 2) > 0, "pose": torch.eye(4), "lens": (1.0, 1.0, 0.0, 0.0)}
     with pytest.raises(ValueError, match=message):

@@ -192,18 +192,15 @@ def test_rays_that_are_not_finite_get_no_samples(compiled):
     assert not len(march_on(compiled, still, full, 0.1).starts)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"near": torch.zeros(4, 1)}, r"near must have shape \(4,\), got \(4, 1\)"),
-        ({"directions": torch.zeros(3, 3)}, r"directions must have shape \(4, 3\)"),
-        ({"occupancy": torch.zeros(4, 4, 4, dtype=torch.bool)}, "occupancy must be bool of shape"),
-        ({"aabb": torch.zeros(6)}, r"aabb must have shape \(2, 3\)"),
-        ({"step": 0.0}, "step must be > 0"),
-        ({"max_samples_per_ray": 0}, "max_samples_per_ray must be > 0"),
-        ({"skips": torch.zeros(1, 1, 1, 1, dtype=torch.uint8)}, "skips must have shape"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"near": torch.zeros(4, 1)}, r"near must have shape \(4,\), got \(4, 1\)"),
+    ({"directions": torch.zeros(3, 3)}, r"directions must have shape \(4, 3\)"),
+    ({"occupancy": torch.zeros(4, 4, 4, dtype=torch.bool)}, "occupancy must be bool of shape"),
+    ({"aabb": torch.zeros(6)}, r"aabb must have shape \(2, 3\)"),
+    ({"step": 0.0}, "step must be > 0"),
+    ({"max_samples_per_ray": 0}, "max_samples_per_ray must be > 0"),
+    ({"skips": torch.zeros(1, 1, 1, 1, dtype=torch.uint8)}, "skips must have shape"),
+])  # fmt: skip
 def test_wrong_arguments_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         march(**rays(4) | {"occupancy": grid(), "aabb": BOX, "step": 0.1} | change)
@@ -266,15 +263,12 @@ def test_what_fits_is_what_is_marched(seed, share, size):
     assert int(actual.offsets[-1]) == size == len(actual.starts)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"size": 0}, "rays and places for samples, got 30 and 0"),
-        (rays(0), "got 0 and 10"),
-        ({"step": torch.ones(1)}, "step must be a scalar"),
-        ({"near": torch.zeros(3)}, "near must have shape"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"size": 0}, "rays and places for samples, got 30 and 0"),
+    (rays(0), "got 0 and 10"),
+    ({"step": torch.ones(1)}, "step must be a scalar"),
+    ({"near": torch.zeros(3)}, "near must have shape"),
+])  # fmt: skip
 def test_wrong_arguments_of_march_to_size_are_refused(changes, message):
     arguments = rays(30) | {"occupancy": grid(), "aabb": BOX, "step": STEP, "size": 10} | changes
     with pytest.raises(ValueError, match=message):

@@ -130,17 +130,14 @@ def test_half_precision_is_widened():
         assert torch.autograd.grad(out.sum(), ones)[0].dtype == torch.bfloat16
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda d, v, w, o: packed_weights(d[:, None], o), r"optical_depth must have shape \(N,\), got \(4, 1\)"),
-        (lambda d, v, w, o: packed_weights(d, o.int()), "offsets must be int64"),
-        (lambda d, v, w, o: packed_weights(d[:3], o), "offsets must run from 0 to 3, got 0 to 4"),
-        (lambda d, v, w, o: packed_sum(v, w[:3], o), r"weights must have shape \(4,\), got \(3,\)"),
-        (lambda d, v, w, o: packed_sum(v[None], w, o), "values must have shape"),
-        (lambda d, v, w, o: packed_sum(v[:3], None, o), "offsets must run from 0 to 3, got 0 to 4"),
-    ],
-)
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda d, v, w, o: packed_weights(d[:, None], o), r"optical_depth must have shape \(N,\), got \(4, 1\)"),
+    (lambda d, v, w, o: packed_weights(d, o.int()), "offsets must be int64"),
+    (lambda d, v, w, o: packed_weights(d[:3], o), "offsets must run from 0 to 3, got 0 to 4"),
+    (lambda d, v, w, o: packed_sum(v, w[:3], o), r"weights must have shape \(4,\), got \(3,\)"),
+    (lambda d, v, w, o: packed_sum(v[None], w, o), "values must have shape"),
+    (lambda d, v, w, o: packed_sum(v[:3], None, o), "offsets must run from 0 to 3, got 0 to 4"),
+])  # fmt: skip
 def test_wrong_arguments_are_refused(call, message):
     with kernels.use_backend("numba"), pytest.raises(ValueError, match=message):
         call(*packed((4,)))

@@ -248,6 +248,19 @@ def test_trials_of_several_parts_share_one_budget() -> None:
     assert sum(steps) <= 0.09 * 800
 
 
+def test_first_steps_are_of_the_first_candidate_and_short_trainings_stay_with_it() -> None:
+    made: list[str] = []
+    noting = lambda choices: (made.append(choices["rate"]), make(choices))[1]  # noqa: E731
+    parts, frames = {"rate": Part("how fast", CANDIDATES, "quick", at=0.1, first="slow")}, small_frames(24)
+    plan, run = make_plan(parts, {}, noting, frames, BOX, share=0.05)
+    assert (made, plan.decisions["rate"].by) == (["slow", "quick", "slow"], "trial")
+    parts["rate"].at = 0.05  # 40 of 800 steps
+    plan, run = make_plan(parts, {}, noting, frames, BOX, share=0.05)
+    assert run is not None
+    assert (run.step, made[3:], plan.choices) == (40, ["slow"], {"rate": "slow"})
+    assert make_plan(parts, {}, noting, small_frames(6), BOX)[0].choices == {"rate": "quick"}
+
+
 def test_nothing_is_trained_for_what_is_given_seen_cannot_be_tried_or_does_not_arise() -> None:
     class Sees(Evidence):
         def find(self, frames: Frames, box: torch.Tensor) -> Finding:
