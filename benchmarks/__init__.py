@@ -9,14 +9,6 @@ from benchmarks.suite import Plot, Series, Settings, SuiteResult, Table, run_sui
 from benchmarks.timing import num_threads
 
 __all__ = [
-    "Plot",
-    "Series",
-    "Settings",
-    "SuiteResult",
-    "Table",
-    "describe_machine",
-    "num_threads",
-    "run_suite",
-    "suite_names",
-    "write_report",
-]
+    "Plot", "Series", "Settings", "SuiteResult", "Table", "describe_machine", "num_threads", "run_suite",
+    "suite_names", "write_report",
+]  # fmt: skip

@@ -118,11 +118,8 @@ def turn_about_z(positions: Tensor, angles: Tensor) -> Tensor:
 
 
 CLOSED_FLOWS: dict[str, type[ClosedFlow]] = {
-    "rotation": Rotation,
-    "shear": Shear,
-    "expansion": Expansion,
-    "swirl": Swirl,
-}
+    "rotation": Rotation, "shear": Shear, "expansion": Expansion, "swirl": Swirl
+}  # fmt: skip
 
 
 class _CountedVelocity(Velocity):

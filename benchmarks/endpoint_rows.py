@@ -57,16 +57,11 @@ def endpoint_rows(
         points, target = start[alone], truth[alone]
         moved, residual = carry(model, points, time, end)
         errors = (moved - target).norm(dim=-1)
-        rows.append(
-            {
-                "time": end,
-                "num_points": len(points),
-                "moved": float((points - target).norm(dim=-1).mean()),
-                "mean_error": float(errors.mean()),
-                "median_error": float(errors.median()),
-                "residual": float(residual.median()),
-            }
-        )
+        rows.append({
+            "time": end, "num_points": len(points), "moved": float((points - target).norm(dim=-1).mean()),
+            "mean_error": float(errors.mean()), "median_error": float(errors.median()),
+            "residual": float(residual.median()),
+        })  # fmt: skip
     if not rows:
         raise ValueError(f"scene must have points that are in one body only at one of the times {list(times)}")
     return rows

@@ -12,6 +12,8 @@ ROUNDED = 1e-14
 """Errors below this are float64's rounding."""
 SMALL = 0.5
 """Errors above this, in world units, say nothing of an order of convergence."""
+ORDERS_NOTE = f"Least squares over the last three errors between rounding and {SMALL:g}."
+VARIANTS_NOTE = "Samples of one training step, networks in bfloat16 where the machine has it; ratio to the first row."
 LOST = 2.0
 """Errors above this, in world units, are as large as the scene: a solver that explodes, which would spoil a plot."""
 ENOUGH = 1e-3
@@ -36,16 +38,8 @@ def run(settings: Settings) -> SuiteResult:
         "dopri8, bosh3, adaptive_heun, of torchdiffeq) tolerances from 1e-2 to 1e-6. An expansion and a rotation do "
         "not depend on time. The network has thin features, which coarse steps miss: its orders show late.",
         tables=[
-            Table(
-                "Orders of convergence",
-                _orders(solvers),
-                f"Least squares over the last three errors between rounding and {SMALL:g}.",
-            ),
-            Table(
-                "Variants",
-                costs,
-                "Samples of one training step, networks in bfloat16 where the machine has it; ratio to the first row.",
-            ),
+            Table("Orders of convergence", _orders(solvers), ORDERS_NOTE),
+            Table("Variants", costs, VARIANTS_NOTE),
             Table("Solvers", solvers),
         ],
         plots=[*(_plot(solvers, field) for field in fields), _costs_plot(costs)],

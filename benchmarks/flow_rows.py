@@ -102,12 +102,9 @@ def _measure(flow: FlowDeformation, positions: Tensor, times: Tensor, truth: Ten
     carried = flow(positions, times)
     errors = (carried - truth).norm(dim=-1)
     return {
-        "evaluations": evaluations,
-        **timing.milliseconds,
-        "max_error": float(errors.max()),
-        "mean_error": float(errors.mean()),
-        "round_trip": _round_trip(flow, carried, times, positions),
-    }
+        "evaluations": evaluations, **timing.milliseconds, "max_error": float(errors.max()),
+        "mean_error": float(errors.mean()), "round_trip": _round_trip(flow, carried, times, positions),
+    }  # fmt: skip
 
 
 def _round_trip(flow: FlowDeformation, carried: Tensor, times: Tensor, positions: Tensor) -> float:
@@ -190,15 +187,10 @@ def variant_rows(
             forward_time = timed(forward, repeats, device)
         training = timed(step, repeats, device)
         evaluations = count_evaluations(deformation, forward) or 1
-        rows.append(
-            {
-                "variant": name,
-                "evaluations": evaluations,
-                "forward_ms": 1e3 * forward_time.median,
-                "training_ms": 1e3 * training.median,
-                "training_low_ms": 1e3 * training.low,
-                "training_high_ms": 1e3 * training.high,
-                "ratio": 1e3 * training.median / (rows[0]["training_ms"] if rows else 1e3 * training.median),
-            }
-        )
+        rows.append({
+            "variant": name, "evaluations": evaluations, "forward_ms": 1e3 * forward_time.median,
+            "training_ms": 1e3 * training.median, "training_low_ms": 1e3 * training.low,
+            "training_high_ms": 1e3 * training.high,
+            "ratio": 1e3 * training.median / (rows[0]["training_ms"] if rows else 1e3 * training.median),
+        })  # fmt: skip
     return rows

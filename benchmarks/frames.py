@@ -124,14 +124,9 @@ def _plot(rows: list[dict[str, Any]]) -> Plot:
         notes = [row["way"] for row in part]
         series.append(Series(name, x, y, x_low=low, x_high=high, notes=notes, style="points"))
     return Plot(
-        name="frames",
-        title="Quality against time of a frame",
-        x_label="time per frame (ms)",
-        y_label="PSNR (dB)",
-        series=series,
-        y_log=False,
-        note="Up and left is better; bars are the quartiles of time.",
-    )
+        name="frames", title="Quality against time of a frame", x_label="time per frame (ms)", y_label="PSNR (dB)",
+        series=series, y_log=False, note="Up and left is better; bars are the quartiles of time.",
+    )  # fmt: skip
 
 
 def _findings(rows: list[dict[str, Any]]) -> list[str]:

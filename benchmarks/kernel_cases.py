@@ -158,20 +158,15 @@ def _packed_cases(work: Workload, n: int) -> list[Case]:
     weights = packed_weights(work.depth, offsets)
     return [
         *_both(
-            "packed_weights",
-            lambda d: packed_weights(d, offsets),
-            lambda d: plain_packed_weights(d, work.marched.ray_indices, offsets),
-            (work.depth,),
-            (2 * n, 6 * n),
+            "packed_weights", lambda d: packed_weights(d, offsets),
+            lambda d: plain_packed_weights(d, work.marched.ray_indices, offsets), (work.depth,), (2 * n, 6 * n),
         ),
         *_both(
-            "packed_sum",
-            lambda v, w: packed_sum(v, w, offsets),
+            "packed_sum", lambda v, w: packed_sum(v, w, offsets),
             lambda v, w: torch.segment_reduce(v * w[:, None], "sum", offsets=offsets, axis=0),
-            (work.values, weights),
-            (6 * n + out, 18 * n + 2 * out),
+            (work.values, weights), (6 * n + out, 18 * n + 2 * out),
         ),
-    ]
+    ]  # fmt: skip
 
 
 def _network_cases(work: Workload, n: int) -> list[Case]:
@@ -186,20 +181,14 @@ def _network_cases(work: Workload, n: int) -> list[Case]:
     return [
         Case("grid_network", "forward", backends(evaluate), 3 * n + 4 * n + work.used_bytes),
         *_both(
-            "relu_layers",
-            _in_bfloat16,
-            None,
-            (work.inputs, *work.layers),
+            "relu_layers", _in_bfloat16, None, (work.inputs, *work.layers),
             (activations + layers, 3 * activations + 3 * layers),
         ),
         *_both(
-            "series_sums",
-            series_sums,
-            None,
-            [x.contiguous() for x in work.series.split(SERIES, dim=1)],
+            "series_sums", series_sums, None, [x.contiguous() for x in work.series.split(SERIES, dim=1)],
             (n * (sum(SERIES) + 4), n * (3 * sum(SERIES) + 4)),
         ),
-    ]
+    ]  # fmt: skip
 
 
 def _layers(widths: Sequence[int], normal: Callable[..., Tensor]) -> list[Tensor]:

@@ -61,19 +61,13 @@ def _measure(case: Case, samples: int, threads: int, rates: Rates, settings: Set
     limit = case.num_bytes / rates.bandwidth
     return [
         {
-            "kernel": case.kernel,
-            "direction": case.direction,
-            "samples": samples,
-            "threads": threads,
-            "variant": variant,
-            "replayed": variant in replays,
-            **timing.milliseconds,
-            "times_compiled": timing.median / timings[COMPILED].median,
-            "limit_ms": 1e3 * limit,
+            "kernel": case.kernel, "direction": case.direction, "samples": samples, "threads": threads,
+            "variant": variant, "replayed": variant in replays, **timing.milliseconds,
+            "times_compiled": timing.median / timings[COMPILED].median, "limit_ms": 1e3 * limit,
             "times_limit": timing.median / limit,
         }
         for variant, timing in timings.items()
-    ]
+    ]  # fmt: skip
 
 
 def _plot(rows: list[dict[str, Any]], direction: str) -> BarPlot:

@@ -18,14 +18,10 @@ PACKAGES = ("torch", "numpy", "numba", "triton", "torchdiffeq")
 def describe_machine() -> dict[str, Any]:
     """Hardware, versions and commit, as a report records them. What cannot be found out is "unknown"."""
     return {
-        "hardware": hardware(),
-        "threads": torch.get_num_threads(),
-        "memory_GiB": _memory_gib(),
-        "system": platform.platform(terse=True),
-        "python": platform.python_version(),
-        **{name: _version(name) for name in PACKAGES},
-        "commit": commit(),
-    }
+        "hardware": hardware(), "threads": torch.get_num_threads(), "memory_GiB": _memory_gib(),
+        "system": platform.platform(terse=True), "python": platform.python_version(),
+        **{name: _version(name) for name in PACKAGES}, "commit": commit(),
+    }  # fmt: skip
 
 
 def _memory_gib() -> float | str:

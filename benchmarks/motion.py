@@ -65,14 +65,9 @@ def _measured(settings: Settings, options: dict[str, Any], scene: str, experimen
     ends = endpoint_rows(model.cpu(), make_scene(scene))
     means = {name: fmean(row[name] for row in ends) for name in ("moved", "mean_error", "median_error", "residual")}
     return {
-        "scene": scene,
-        "experiment": experiment,
-        "seed": seed,
-        "steps": trained.num_steps,
-        **means,
-        "psnr": trained.psnr,
-        "model_MiB": trained.model_mib,
-    }
+        "scene": scene, "experiment": experiment, "seed": seed, "steps": trained.num_steps, **means,
+        "psnr": trained.psnr, "model_MiB": trained.model_mib,
+    }  # fmt: skip
 
 
 def _mean(rows: list[Row], scene: str, experiment: str) -> float:

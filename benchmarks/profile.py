@@ -192,15 +192,11 @@ def _result(probe: Probe, rates: Mapping[int, Rates], settings: Settings) -> Sui
     samples, rays = (round(sum(v) / len(v)) for v in (probe.num_samples, probe.num_rays))
     steps = [
         {
-            "threads": count,
-            **timing.milliseconds,
-            "steps_per_second": 1 / timing.median,
-            "samples_per_step": samples,
-            "rays_per_step": rays,
-            "times_one_core": timings[1].median / timing.median,
+            "threads": count, **timing.milliseconds, "steps_per_second": 1 / timing.median,
+            "samples_per_step": samples, "rays_per_step": rays, "times_one_core": timings[1].median / timing.median,
         }
         for count, timing in timings.items()
-    ]
+    ]  # fmt: skip
     floor = sum(f.seconds for f in floors.values()) / WINDOW
     columns = {f"{n} thread{'s' * (n > 1)}": [1e3 * parts[n].get(part, 0.0) for part in names] for n in probe.threads}
     columns["floor"] = [1e3 * floors[part].seconds / WINDOW if part in floors else float("nan") for part in names]

@@ -31,6 +31,7 @@ EDGES = 1.0
 """Order at hard edges, where the share of an interval that is full is a matter of chance."""
 ROUNDED = 2e-7
 """Errors below this are float32's rounding."""
+ORDERS_NOTE = f"Least squares over the last four errors between {ROUNDED:g} (rounding) and 0.05."
 
 
 def run(settings: Settings) -> SuiteResult:
@@ -68,11 +69,7 @@ def run(settings: Settings) -> SuiteResult:
             "part of the interval at a surface is full is a matter of chance."
         ),
         tables=[
-            Table(
-                "Orders of convergence",
-                orders,
-                f"Least squares over the last four errors between {ROUNDED:g} (rounding) and 0.05.",
-            ),
+            Table("Orders of convergence", orders, ORDERS_NOTE),
             Table("Errors", rows),
         ],
         plots=plots,
@@ -98,14 +95,10 @@ def methods(field: RadianceField, quick: bool = False) -> dict[str, Method]:
         return _composite(field, rays, sampler(rays, field), "constant")
 
     found: dict[str, Method] = {
-        "constant": equal("constant"),
-        "left edge": equal("constant", left=True),
-        "stratified": equal("constant", training=True),
-        "stratified, linear": equal("linear", training=True),
-        "linear": equal("linear"),
-        "parabolic": equal("parabolic"),
-        "importance": importance,
-    }
+        "constant": equal("constant"), "left edge": equal("constant", left=True),
+        "stratified": equal("constant", training=True), "stratified, linear": equal("linear", training=True),
+        "linear": equal("linear"), "parabolic": equal("parabolic"), "importance": importance,
+    }  # fmt: skip
     box = field.box.tolist()  # type: ignore[operator]
     grid = OccupancyGrid(box, 16 if quick else 40, num_slabs=4 if quick else 16, threshold=1e-3)
     grid.fill(field, 2 if quick else 4)

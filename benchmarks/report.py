@@ -36,13 +36,10 @@ def write_report(result: SuiteResult, folder: Path, *, command: str, machine: Ma
     for table in result.tables:
         write_text(folder / f"{table_name(table)}.csv", as_csv(table.rows))
     values = {
-        "title": result.title,
-        "command": command,
-        "date": date,
-        "machine": dict(machine),
+        "title": result.title, "command": command, "date": date, "machine": dict(machine),
         "findings": list(result.findings),
         "tables": {table_name(t): [_plain(row) for row in t.rows] for t in result.tables},
-    }
+    }  # fmt: skip
     write_json(folder / "results.json", values)
     write_text(folder / "report.md", as_markdown(result, command=command, machine=machine, date=date))
     return folder / "report.md"

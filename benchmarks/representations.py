@@ -56,20 +56,13 @@ def run(settings: Settings) -> SuiteResult:
 
 def _row(name: str, kind: dict[str, Any], runs: list[Run]) -> dict[str, Any]:
     return {
-        "representation": name,
-        "stores": kind["stores"],
-        "overrides": " ".join(kind["overrides"]),
-        "parameters": runs[0].num_parameters,
-        "MiB": fmean(run.model_mib for run in runs),
-        "steps": round(fmean(run.num_steps for run in runs)),
-        "step_ms": fmean(run.step_ms for run in runs),
-        "frame_s": fmean(run.seconds_per_frame for run in runs),
-        "peak_MiB": max(run.peak_mib for run in runs),
-        "seeds": len(runs),
-        "psnr": fmean(run.psnr for run in runs),
-        "psnr_low": min(run.psnr for run in runs),
+        "representation": name, "stores": kind["stores"], "overrides": " ".join(kind["overrides"]),
+        "parameters": runs[0].num_parameters, "MiB": fmean(run.model_mib for run in runs),
+        "steps": round(fmean(run.num_steps for run in runs)), "step_ms": fmean(run.step_ms for run in runs),
+        "frame_s": fmean(run.seconds_per_frame for run in runs), "peak_MiB": max(run.peak_mib for run in runs),
+        "seeds": len(runs), "psnr": fmean(run.psnr for run in runs), "psnr_low": min(run.psnr for run in runs),
         "psnr_high": max(run.psnr for run in runs),
-    }
+    }  # fmt: skip
 
 
 def _parts_of_a_step(settings: Settings, options: dict[str, Any], words: list[str]) -> dict[str, Any]:

@@ -63,12 +63,15 @@ def results_page(folder: Path) -> str:
 def plot_of_all(folder: Path) -> Plot | None:
     """PSNR against seconds of training on CPUs, of all experiments of which reports at 400 x 400 have several budgets.
 
+    A CPU without bfloat16 takes three times as long a step, so its reports are left out.
+
     Of two reports of the same, the later one counts. None if there is nothing to show; ValueError as `results_page`.
     """
     rows = {}
     for report in sorted(_reports(folder).values(), key=lambda report: report["date"]):
         for row in report["tables"].get(QUALITY, []):
-            if row.get("resolution") == 400 and "NVIDIA" not in report["machine"]["hardware"]:
+            is_other = any(name in report["machine"]["hardware"] for name in ("NVIDIA", "without bfloat16"))
+            if row.get("resolution") == 400 and not is_other:
                 rows[row["scene"], row["experiment"], row["budget_s"]] = row
     counts = Counter(key[:2] for key in rows)
     shown = [rows[key] for key in sorted(rows) if counts[key[:2]] > 1]
@@ -112,16 +115,12 @@ def _quality(rows: list[Row]) -> Iterator[Row]:
     for row in rows:
         is_one = row["seeds"] == 1
         yield {
-            **{name: row[name] for name in ("scene", "split", "experiment")},
-            "pixels": row.get("resolution"),
-            "seconds": row["budget_s"],
-            "seeds": row["seeds"],
+            **{name: row[name] for name in ("scene", "split", "experiment")}, "pixels": row.get("resolution"),
+            "seconds": row["budget_s"], "seeds": row["seeds"],
             "PSNR": f"{row['psnr']:.2f}" + ("" if is_one else f" [{row['psnr_low']:.2f}, {row['psnr_high']:.2f}]"),
-            "SSIM": f"{row['ssim']:.3f}",
-            "steps": row["steps"],
-            "frame s": row["frame_s"],
+            "SSIM": f"{row['ssim']:.3f}", "steps": row["steps"], "frame s": row["frame_s"],
             "model MiB": row.get("model_MiB"),
-        }
+        }  # fmt: skip
 
 
 def _frames(rows: list[Row]) -> Iterator[Row]:
@@ -145,18 +144,15 @@ def _kernels(rows: list[Row]) -> Iterator[Row]:
     for kernel, direction in dict.fromkeys((row["kernel"], row["direction"]) for row in chosen):
         found = {r["variant"]: r for r in chosen if (r["kernel"], r["direction"]) == (kernel, direction)}
         yield {
-            "kernel": kernel,
-            "direction": direction,
-            "samples": most[0],
-            "compiled ms": found[COMPILED]["median_ms"],
+            "kernel": kernel, "direction": direction, "samples": most[0], "compiled ms": found[COMPILED]["median_ms"],
             "times its least traffic": found[COMPILED]["times_limit"],
             **{f"{name}, times": found.get(name, {}).get("times_compiled") for name in (REFERENCE, PLAIN)},
-        }
+        }  # fmt: skip
 
 
 QUALITY_NOTE = """Held-out frames; with several seeds their mean and, in brackets, worst and best. `model MiB` is the
 size of the weights file. D-NeRF's Lego is scored on `val`: its test split shows another pose than its train split.
-The plot has the latest report of each row at 400 x 400 on CPUs; the commits, below, differ between lines and points."""
+The plot has the latest report of each row at 400 x 400 on CPUs with bfloat16. Commits differ, see below."""
 FRAMES_NOTE = "Each frame alone, in evaluation mode: median and quartiles of the time."
 KERNELS_NOTE = "The compiled version, and how many times as long its definition and the best plain torch take."
 SECTIONS: tuple[tuple[str, str, str, Callable[[list[Row]], Iterator[Row]]], ...] = (

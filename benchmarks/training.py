@@ -71,24 +71,14 @@ def _overrides(
 def _mean_row(scene: str, experiment: str, seconds: float, runs: list[Run], options: dict[str, Any]) -> dict[str, Any]:
     scores = [run.psnr for run in runs]
     return {
-        "scene": scene,
-        "split": options["splits"].get(scene, "test"),
-        "resolution": options["resolution"],
-        "experiment": experiment,
-        "budget_s": seconds,
-        "seeds": len(runs),
-        "psnr": fmean(scores),
-        "psnr_low": min(scores),
-        "psnr_high": max(scores),
-        "ssim": fmean(run.ssim for run in runs),
-        "frames": options["frames"].get(experiment, "all"),
-        "steps": round(fmean(run.num_steps for run in runs)),
-        "step_ms": fmean(run.step_ms for run in runs),
-        "frame_s": fmean(run.seconds_per_frame for run in runs),
-        "model_MiB": max(run.model_mib for run in runs),
-        "peak_MiB": max(run.peak_mib for run in runs),
+        "scene": scene, "split": options["splits"].get(scene, "test"), "resolution": options["resolution"],
+        "experiment": experiment, "budget_s": seconds, "seeds": len(runs), "psnr": fmean(scores),
+        "psnr_low": min(scores), "psnr_high": max(scores), "ssim": fmean(run.ssim for run in runs),
+        "frames": options["frames"].get(experiment, "all"), "steps": round(fmean(run.num_steps for run in runs)),
+        "step_ms": fmean(run.step_ms for run in runs), "frame_s": fmean(run.seconds_per_frame for run in runs),
+        "model_MiB": max(run.model_mib for run in runs), "peak_MiB": max(run.peak_mib for run in runs),
         "parameters": runs[0].num_parameters,
-    }
+    }  # fmt: skip
 
 
 def quality_plot(rows: list[dict[str, Any]]) -> Plot:
@@ -101,14 +91,10 @@ def quality_plot(rows: list[dict[str, Any]]) -> Plot:
             style = STYLES[number % len(STYLES)]
             series.append(Series(f"{scene}, {experiment}", x, y, low, high, style=style, color=color))
     return Plot(
-        name="training",
-        title="Quality against training time",
-        x_label="seconds of training",
-        y_label="PSNR of held-out frames (dB)",
-        series=series,
-        y_log=False,
+        name="training", title="Quality against training time", x_label="seconds of training",
+        y_label="PSNR of held-out frames (dB)", series=series, y_log=False,
         note="A colour for each scene, a style for each experiment. Band: worst to best seed. Up and left is better.",
-    )
+    )  # fmt: skip
 
 
 def _findings(rows: list[dict[str, Any]]) -> list[str]:

@@ -33,29 +33,15 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "core.cameras": ("Camera", "Intrinsics", "look_at"),
-    "core.compositing": ("Rendering", "composite"),
-    "core.rays": ("Rays", "Samples"),
-    "core.schedules": ("Schedule",),
-    "data.bounds": ("fit_box",),
-    "data.frames": ("Frames",),
-    "data.pixel_samplers": ("PixelSampler",),
-    "deformations.base": ("Deformation",),
-    "evaluation.scores": ("evaluate",),
-    "fields.base": ("RadianceField",),
-    "fields.deformed": ("DeformedField",),
-    "fields.grid": ("GridField",),
-    "fields.nerf": ("NeRFField",),
-    "losses.base": ("Loss",),
-    "rendering.renderer": ("Renderer",),
-    "samplers.base": ("Sampler",),
-    "samplers.occupancy": ("OccupancySampler",),
-    "scenes": ("make_scene",),
-    "training.run": ("Callback",),
-    "training.presets": ("load_dataset", "make_renderer", "make_trainer"),
-    "training.runs": ("load_run",),
-    "training.trainer": ("Trainer",),
-}
+    "core.cameras": ("Camera", "Intrinsics", "look_at"), "core.compositing": ("Rendering", "composite"),
+    "core.rays": ("Rays", "Samples"), "core.schedules": ("Schedule",), "data.bounds": ("fit_box",),
+    "data.frames": ("Frames",), "data.pixel_samplers": ("PixelSampler",), "deformations.base": ("Deformation",),
+    "evaluation.scores": ("evaluate",), "fields.base": ("RadianceField",), "fields.deformed": ("DeformedField",),
+    "fields.grid": ("GridField",), "fields.nerf": ("NeRFField",), "losses.base": ("Loss",),
+    "rendering.renderer": ("Renderer",), "samplers.base": ("Sampler",), "samplers.occupancy": ("OccupancySampler",),
+    "scenes": ("make_scene",), "training.run": ("Callback",), "training.runs": ("load_run",),
+    "training.presets": ("load_dataset", "make_renderer", "make_trainer"), "training.trainer": ("Trainer",),
+}  # fmt: skip
 _HOME_OF = {name: f"{__name__}.{home}" for home, names in _HOMES.items() for name in names}
 
 __all__ = [

@@ -20,6 +20,7 @@ from dnerf.core.rays import Rays
 from dnerf.data import DataSource, Frames, SceneRecord, SyntheticData, random_views, render_exact
 from dnerf.data.placing import planes_between
 from dnerf.evaluation import FrameScore, check_consistency, error_shares, evaluate, evaluate_over_time, kinds_of
+from dnerf.evaluation.error_kinds import SeenFromAside
 from dnerf.evaluation.images import lpips_metric
 from dnerf.evaluation.plots import frame_curves
 from dnerf.evaluation.protocols import LEGO, Protocol, csv_table, find_protocol, markdown_table, table_json, table_notes
@@ -77,7 +78,7 @@ def _score(config: DictConfig, run: str, protocol: Protocol | None, lpips: Lpips
     if lpips is not None:
         settings["lpips_backbone"] = config.lpips.backbone
     chunk, name = config.chunk or saved.chunk, f"metrics{suffix}.json"
-    kinds = ErrorKinds(data.frames(split)) if config.kinds else None
+    kinds = ErrorKinds(data.frames(split), renderer, chunk) if config.kinds else None
     metrics = evaluate_run(
         folder, renderer, data, split, max_frames=config.max_frames, chunk=chunk, settings=settings, name=name,
         lpips=lpips, on_frame=kinds,
@@ -133,15 +134,18 @@ def _write_worst(
 class ErrorKinds:
     """Where the error of frames with alpha lies, one line a kind; called with each frame that is scored."""
 
-    def __init__(self, frames: Frames) -> None:
+    def __init__(self, frames: Frames, renderer: Renderer, chunk: int) -> None:
         if not frames.has_alpha:
             raise ValueError("kinds: silhouettes are those of images with alpha, these have none")
-        self.frames = frames
+        self.frames, self.chunk = frames.to(renderer.device), chunk
+        self.aside = Renderer(SeenFromAside(renderer.field), renderer.sampler, renderer.background)
         self.found: list[tuple[Tensor, Tensor]] = []
 
     def __call__(self, score: FrameScore, prediction: Tensor, truth: Tensor) -> None:
-        alpha = self.frames.stored_image(score.index)[..., 3].to(truth.device) / 255
-        self.found.append(((prediction - truth).square().mean(-1).flatten(), kinds_of(truth, alpha).flatten()))
+        alpha = self.frames.stored_image(score.index)[..., 3] / 255
+        aside = self.aside.render_image(self.frames.camera(score.index), score.time, chunk=self.chunk).rgb.clamp(0, 1)
+        kinds = kinds_of(truth, alpha, (aside - prediction).abs().mean(-1))
+        self.found.append(((prediction - truth).square().mean(-1).flatten(), kinds.flatten()))
 
     def __str__(self) -> str:
         shares = error_shares(*(torch.cat(part) for part in zip(*self.found, strict=True)))

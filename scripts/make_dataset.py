@@ -6,7 +6,7 @@ from hydra_app import build, run_app
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from dnerf.data import SPLITS, SyntheticData, film_by_phone, save_blender, save_transforms
+from dnerf.data import SPLITS, SyntheticData, film_by_phone, film_by_rig, save_blender, save_transforms
 from dnerf.visualization.video import check_film, write_frames
 
 
@@ -21,6 +21,9 @@ def main(config: DictConfig) -> None:
         frames = film_by_phone(scene, config.resolution, **counts)
         save_transforms(frames, out)
         print("film:", write_frames(frames["train"].images, config.film, "mp4", fps=config.fps))
+    elif config.cameras is not None:
+        frames = film_by_rig(scene, config.resolution, num_cameras=config.cameras, **counts)
+        save_transforms(frames, out)
     else:
         source = SyntheticData(scene, config.resolution, num_val=config.num_val, seed=config.seed, **counts)
         frames = {split: source.frames(split) for split in tqdm(SPLITS, unit="split")}

@@ -99,6 +99,7 @@ KINDS: Mapping[str, Mapping[str, Kind]] = {
     },
     "make_dataset": {
         "out": TEXT, "film": TEXT.or_null(), "num_val": POSITIVE, "num_test": POSITIVE, "resolution": POSITIVE,
+        "cameras": POSITIVE.or_null(),
     },
     "capture": {
         "video": TEXT.or_null(), "images": TEXT.or_null(), "model": TEXT.or_null(), "masks": TEXT.or_null(),

@@ -113,14 +113,10 @@ def collect(folder: Path) -> list[dict[str, Any]]:
         training, metrics = (_read(folder / name / f"{kind}.json", {}) for kind in ("training", "metrics"))
         status = "failed" if name in errors else "done" if training else "unfinished"
         overrides = [str(override) for override in _read(folder / name / "overrides.json", [])]
-        rows.append(
-            {
-                "run": name,
-                "overrides": dict(override.split("=", 1) for override in overrides if "=" in override),
-                "status": status,
-                **{key: metrics.get(key, training.get(key)) for key in COLUMNS[1:]},
-            }
-        )
+        rows.append({
+            "run": name, "overrides": dict(override.split("=", 1) for override in overrides if "=" in override),
+            "status": status, **{key: metrics.get(key, training.get(key)) for key in COLUMNS[1:]},
+        })  # fmt: skip
     return rows
 
 

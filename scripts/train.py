@@ -116,13 +116,10 @@ def finish(
 ) -> None:
     """Write what a finished run leaves: weights, facts of its training, scores."""
     training = {
-        "train_seconds": record.seconds,
-        "num_steps": record.step,
-        "num_parameters": sum(p.numel() for p in renderer.parameters()),
-        "seed": config.seed,
-        "train_hardware": hardware(),
-        "train_commit": commit(),
-    }
+        "train_seconds": record.seconds, "num_steps": record.step,
+        "num_parameters": sum(p.numel() for p in renderer.parameters()), "seed": config.seed,
+        "train_hardware": hardware(), "train_commit": commit(),
+    }  # fmt: skip
     if resume and is_scored(folder, config, training):
         print(f"{folder}: finished before, nothing to do")
         return

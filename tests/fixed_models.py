@@ -6,7 +6,7 @@ from reference import occupancy_sampler
 from dnerf.core.backgrounds import RandomBackground
 from dnerf.core.schedules import Fade
 from dnerf.deformations import DisplacementDeformation
-from dnerf.fields import DeformedField, GridField, SpaceTimeVolumes
+from dnerf.fields import DeformedField, GridField, PlaneFeatures
 from dnerf.losses import (
     AppearanceConstancyLoss,
     ElasticLoss,
@@ -23,10 +23,10 @@ BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
 def small_renderer(*, graphs: bool = False, device: str = "cpu", **sampling: object) -> Renderer:
     """Deformation, grid and occupancy in a size that trains in no time."""
     torch.manual_seed(0)
-    volumes = SpaceTimeVolumes(BOX, (8,), (4,))
+    planes = PlaneFeatures(BOX, (8,), 4)
     field = DeformedField(
         DisplacementDeformation(2, 32, (), position_frequencies=2, time_frequencies=2),
-        GridField(BOX, (8, 16), 4, hidden_features=32, temporal_terms=2, window_end=0.4, space_time=volumes),
+        GridField(BOX, (8, 16), 4, hidden_features=32, temporal_terms=2, window_end=0.4, space_time=planes),
     )
     options = {
         "num_probes": 512, "min_weight": 1e-4, "subdivision_weight": 0.02, "subdivision": 2, "pad_to": 1, **sampling

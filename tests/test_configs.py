@@ -76,7 +76,7 @@ def test_config_composes_instantiates_and_takes_a_step(choice: str) -> None:
 
 
 def test_every_loss_joins_the_flow() -> None:
-    added = ("field=grid_space_time", "+trainer/losses=[smoothness,rest,distortion]")
+    added = ("field=planes_canonical", "+trainer/losses=[smoothness,rest,distortion]")
     of_surfaces = {"eikonal"}  # that field has none: see `experiment=sdf`
     changes = (*added, *TINY, "~trainer.callbacks", "trainer.num_steps=4")
     data, renderer, trainer = parts("experiment=flow", *changes)

@@ -25,6 +25,7 @@ LEAST_SHIFT = 0.01  # of the diagonal, between the two frames that differ most
 GOOD_TRACK, GOOD_ERROR = 3, 2.0  # frames that see a point, and pixels, of points that are kept
 TEXTURE = "film things with texture, in good light and in focus: a carpet, shelves, leaves rather than bare walls"
 WALK = "walk around what moves, a step for each second, with the camera on it, rather than stand or turn on the spot"
+CLOSER = "stand neighbouring cameras within 10 to 15 degrees of each other, or walk a bit with each before it stands"
 SLOWLY = "film in one take, slowly, so that each frame shows most of the one before"
 
 
@@ -78,6 +79,8 @@ def find_structure(
     _match(database, image_pairs(list(films.values()), matching), work / "pairs.txt")
     _check_matches(database, frames)
     models = _map(database, images, work / "models", len(frames))
+    if not models and len(films) > 1:
+        raise ValueError(f"no camera could be placed: the {len(films)} films show too little in common; {CLOSER}")
     if not models:
         raise ValueError(f"no camera could be placed: the camera turns on the spot, or jumps; {WALK}; {SLOWLY}")
     return sorted(models, key=lambda model: -model.num_reg_images())

@@ -158,13 +158,9 @@ def composite(
     if shares is not None:
         weights = spread_weights(weights, shares, samples)
     columns = torch.cat(
-        [
-            at_least_float32(output.rgb).to(weights.dtype),
-            samples.distances[..., None].to(weights.dtype),
-            torch.ones_like(weights)[..., None],
-        ],
-        dim=-1,
-    )
+        [at_least_float32(output.rgb).to(weights.dtype), samples.distances[..., None].to(weights.dtype),
+         torch.ones_like(weights)[..., None]], dim=-1,
+    )  # fmt: skip
     sums = sum_along_rays(columns, samples, weights)
     rgb, depth, opacity = sums[:, :3], sums[:, 3], sums[:, 4].clamp(max=1)
     rendering = Rendering(

@@ -168,3 +168,14 @@ def box_planes(poses: Tensor, box: Sequence[Sequence[float]] | Tensor) -> list[t
     depths = -(offsets * poses[:, None, :3, 2]).sum(-1)
     nearest, farthest = depths.amin(-1).clamp(min=0).tolist(), depths.amax(-1).clamp(min=MIN_DEPTH).tolist()
     return list(zip(nearest, farthest))
+
+
+def distinct_places(places: Tensor, tolerance: float, most: int) -> Tensor:
+    """One of each group of places (F, 3) closer than a tolerance to each other; no more than `most` and one."""
+    found = places[:1]
+    while len(found) <= most:
+        distances = torch.cdist(places, found).amin(1)
+        if float(distances.max()) <= tolerance:
+            break
+        found = torch.cat([found, places[distances.argmax()][None]])
+    return found

@@ -1,4 +1,4 @@
-"""A film as a phone in a hand makes it, of an exact scene: slow and jerky, through a lens, with drifting exposure."""
+"""Films of an exact scene: by a phone in a hand, slow and jerky, with drifting exposure; and by a rig that stands."""
 
 import math
 from dataclasses import replace
@@ -61,7 +61,32 @@ def film_by_phone(scene: AnalyticScene, width: int, *, num_train: int, num_test:
     render = partial(render_frames, scene, background=SKY, planes=PLANES, oversampling=2)
     train = render(phone_poses(times), times, phone_lens(width), gains=phone_gains(times))
     times = (torch.arange(num_test) + 0.5) / num_test
-    angles = (-0.5 * math.pi + 0.6 * torch.cos(2 * math.pi * times)).tolist()
-    poses = [look_at((0.37 * math.cos(a), 0.37 * math.sin(a), 0.03), (0.0, 0.0, -0.07)) for a in angles]
+    poses = [_inwards(angle, 0.03) for angle in (0.6 * torch.cos(2 * math.pi * times)).tolist()]
     lens = replace(phone_lens(width), distortion=None)
     return {"train": train, "test": render(torch.stack(poses), times, lens, gains=torch.ones(num_test, 3))}
+
+
+def film_by_rig(
+    scene: AnalyticScene, width: int, *, num_cameras: int, num_train: int, num_test: int
+) -> dict[str, Frames]:  # fmt: skip
+    """Frames of cameras that stand on an arc, "train", and of one between them, "test", which has the exposure 1.
+
+    Each camera is exposed in its own way, by up to 0.35 stops, and takes an image at each of `num_train` times.
+    """
+    numbers = torch.arange(num_cameras).double()
+    angles = 0.8 * (2 * numbers / max(num_cameras - 1, 1) - 1)
+    stops, tint = 0.35 * torch.cos(2.4 * numbers), 0.08 * torch.sin(1.7 * numbers)
+    gains = torch.stack([stops + tint, stops, stops - tint], dim=-1).float().exp2()
+    poses = [_inwards(angle, -0.02 + 0.08 * (k % 2)) for k, angle in enumerate(angles.tolist())]
+    render = partial(render_frames, scene, background=SKY, planes=PLANES, oversampling=2)
+    lens = replace(phone_lens(width), distortion=None)
+    shown = torch.stack(poses).repeat_interleave(num_train, 0), torch.linspace(0, 1, num_train).repeat(num_cameras)
+    train = render(*shown, lens, gains=gains.repeat_interleave(num_train, 0))
+    held_out = torch.stack([_inwards(0.13, 0.03)] * num_test), torch.linspace(0, 1, num_test)
+    return {"train": train, "test": render(*held_out, lens, gains=torch.ones(num_test, 3))}
+
+
+def _inwards(angle: float, height: float) -> Tensor:
+    """A pose (4, 4) at 0.37 from the middle, so many radians from -y, that looks at it."""
+    place = (0.37 * math.sin(angle), -0.37 * math.cos(angle), height)
+    return look_at(place, (0.0, 0.0, -0.07))

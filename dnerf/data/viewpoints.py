@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dnerf.core.cameras import Intrinsics
+from dnerf.core.geometry import distinct_places
 from dnerf.data.normalization import Vector
 from dnerf.data.pixel_layout import evenly_spread
 
@@ -176,7 +177,7 @@ def unknown_parts(views: Viewpoints, focus: Tensor | None) -> str | None:
     distance = max(views.spread, _depth_of_origin(views) or 0.0)
     if focus is not None:
         distance = float(depths_of(views, focus).abs().median())
-    places = _distinct(views.positions, SAME_PLACE * distance)
+    places = distinct_places(views.positions, SAME_PLACE * distance, FEW)
     if len(places) == 1:
         return (
             "all training images are of one camera that stands still: depth and what it does not see cannot be "
@@ -194,14 +195,3 @@ def unknown_parts(views: Viewpoints, focus: Tensor | None) -> str | None:
             "determined"
         )
     return None
-
-
-def _distinct(positions: Tensor, tolerance: float) -> Tensor:
-    """One of each group of positions (F, 3) closer than a tolerance to each other; no more than are few and one."""
-    places = positions[:1]
-    while len(places) <= FEW:
-        distances = torch.cdist(positions, places).amin(1)
-        if float(distances.max()) <= tolerance:
-            break
-        places = torch.cat([places, positions[distances.argmax()][None]])
-    return places

@@ -10,12 +10,13 @@ import torch
 
 from dnerf import __version__
 from dnerf.core.process import usable_cores
+from dnerf.kernels import has_bfloat16
 
 
 @cache
 def hardware() -> str:
     """The processor, the number of cores this process may use and the GPU if there is one, in one line."""
-    parts = [f"{len(usable_cores())} x {_processor()}"]
+    parts = [f"{len(usable_cores())} x {_processor()}{'' if has_bfloat16('cpu') else ' without bfloat16'}"]
     if torch.cuda.is_available():
         parts.append(torch.cuda.get_device_name())
     return ", ".join(parts)

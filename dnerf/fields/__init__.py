@@ -17,13 +17,12 @@ from dnerf.fields.nerf import NeRFField
 from dnerf.fields.normals import NormalField, normals
 from dnerf.fields.planes import PlaneFeatures, PlanesField
 from dnerf.fields.sdf import NeuSField, SDFField, VolSDFField
-from dnerf.fields.space_time import SpaceTimeVolumes
 from dnerf.fields.surroundings import SurroundingsBackground
 from dnerf.fields.voxels import VoxelField
 
 __all__ = [
     "AmbientCoordinates", "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware",
     "NeRFField", "NetworkTabled", "NeuSField", "NormalField", "PlaneFeatures", "PlanesField", "RadianceField",
-    "SDFField", "SignedDistance", "SpaceTimeVolumes", "SurroundingsBackground", "TimeDependence", "VolSDFField",
+    "SDFField", "SignedDistance", "SurroundingsBackground", "TimeDependence", "VolSDFField",
     "VoxelField", "evaluate_along_rays", "normals",
 ]  # fmt: skip

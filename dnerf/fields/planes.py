@@ -5,17 +5,22 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dnerf.core.checks import check_choice, check_whole
+from dnerf.core.checks import as_box, check_choice, check_positive, check_whole
+from dnerf.core.geometry import cubes, in_unit_cube
+from dnerf.deformations.base import check_positions_times
+from dnerf.fields.base import HasRoughness, training_gib
 from dnerf.fields.head import HeadedField
-from dnerf.fields.space_time import LatticeFeatures, SpaceTimeFeatures
+from dnerf.fields.space_time import SpaceTimeFeatures
+from dnerf.kernels import GridLevels, grid_encode
 
 AXES = ((0, 1), (0, 2), (1, 2), (2, 3), (1, 3), (0, 3))
 """The axes of each plane, time the last of four: three of space, then for each of them what it leaves out."""
 
 JOINS = ("product", "pairs")
+MAX_GIB = 16  # of planes, in training
 
 
-class PlaneFeatures(LatticeFeatures):
+class PlaneFeatures(SpaceTimeFeatures, HasRoughness):
     """Products of planes, interpolated at several resolutions: four dimensions at the price of two.
 
     Joined by a "product", a feature is `a(x, y) b(x, z) c(y, z) d(z, t) e(y, t) f(x, t)` (K-Planes): what all six agree
@@ -33,26 +38,56 @@ class PlaneFeatures(LatticeFeatures):
         join: "product" or "pairs".
 
     Raises:
-        ValueError: for a box or sizes out of range, or another way to join.
+        ValueError: for a box or sizes out of range, planes beyond 16 GiB, or another way to join.
     """
 
     def __init__(
         self, box: Sequence[Sequence[float]], resolutions: Sequence[int] = (64, 128, 256), num_times: int | None = 25,
         *, num_features: int = 8, join: str = "product",
     ) -> None:  # fmt: skip
+        super().__init__()
         check_choice("join", join, JOINS)
-        axes, num_times = (AXES[:3], 1) if num_times is None else (AXES, num_times)
-        check_whole("num_times", num_times)
-        super().__init__(box, axes, resolutions, [num_times] * len(resolutions), num_features)
-        for some, plane in zip(axes, self.tables, strict=True):
+        check_positive("num_features", num_features)
+        self.axes = AXES[:3] if num_times is None else AXES
+        num_times = 1 if num_times is None else num_times
+        for name, numbers in (("resolutions", resolutions), ("num_times", [num_times])):
+            for number in numbers:
+                check_whole(name, number)
+        corners = as_box(box)
+        cells = [[*cubes(corners, resolution), num_times] for resolution in resolutions]
+        gib = training_gib(num_features * sum((n[i] + 1) * (n[j] + 1) for n in cells for i, j in self.axes))
+        if gib > MAX_GIB:
+            raise ValueError(
+                f"resolutions {list(resolutions)}, with {num_times} cells of time, need {gib:.0f} GiB in training, of "
+                f"at most {MAX_GIB}: use coarser ones"
+            )
+        self.levels = tuple(GridLevels.dense([[n[i], n[j], 0] for n in cells]) for i, j in self.axes)
+        self.tables = nn.ParameterList(
+            nn.Parameter(torch.empty(levels.num_rows, num_features)) for levels in self.levels
+        )
+        for some, plane in zip(self.axes, self.tables, strict=True):
             nn.init.ones_(plane) if 3 in some else nn.init.uniform_(plane, 0.1, 0.5)
-        self.join = join
-        self.out_features *= 3 if join == "pairs" else 1
+        self.low = nn.Buffer(corners[0], persistent=False)
+        self.scale = nn.Buffer(1 / (corners[1] - corners[0]), persistent=False)
+        self.join, self.num_levels = join, len(resolutions)
+        self.out_features = self.num_levels * num_features * (3 if join == "pairs" else 1)
 
     @property
     def is_static(self) -> bool:
         """Whether there are planes of space alone."""
         return len(self.tables) == 3
+
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Features (..., n), level by level, at positions (..., 3) and times (...,) in [0, 1]."""
+        check_positions_times(positions, times)
+        unit = in_unit_cube(positions, self.low, self.scale)
+        columns = [*unit.unbind(-1), times.to(positions.dtype).reshape(-1)]
+        values = [
+            # A plane's third column counts for nothing.
+            grid_encode(torch.stack([columns[i], columns[j], columns[0]], dim=-1), table, levels)
+            for (i, j), table, levels in zip(self.axes, self.tables, self.levels, strict=True)
+        ]
+        return self._joined(values).reshape(*times.shape, self.out_features)
 
     def _joined(self, values: list[Tensor]) -> Tensor:
         if not self.is_static:
@@ -60,6 +95,24 @@ class PlaneFeatures(LatticeFeatures):
         if self.join == "product":
             return values[0] * values[1] * values[2]
         return torch.cat([x.unflatten(-1, (self.num_levels, -1)) for x in values], dim=-1)  # level by level
+
+    def roughness(self, turn: Tensor | int = 0) -> tuple[Tensor, Tensor]:
+        """Mean squared differences of neighbours in space, and second differences in time, of all planes; scalars."""
+        space, time = self.low.new_zeros(()), self.low.new_zeros(())
+        for (_, second), table, levels in zip(self.axes, self.tables, self.levels, strict=True):
+            for (u, v, _, first, _), size in zip(levels.describe(), levels.vertices, strict=True):
+                values = table[first : first + size].view(v + 1, u + 1, -1)
+                space = space + _mean_square(values.diff(dim=1))
+                if second == 3:
+                    time = time + _mean_square(values.diff(n=2, dim=0))
+                else:
+                    space = space + _mean_square(values.diff(dim=0))
+        return space, time
+
+
+def _mean_square(values: Tensor) -> Tensor:
+    """0 for none, as of second differences between two times."""
+    return values.square().sum() / max(values.numel(), 1)
 
 
 class PlanesField(HeadedField):

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.core.backgrounds import Background
-from dnerf.core.checks import as_box, check_whole
+from dnerf.core.checks import as_box, check_choice, check_whole
 from dnerf.core.compositing import render_weights
-from dnerf.core.contraction import contract
+from dnerf.core.contraction import SHAPES, contract
 from dnerf.core.geometry import ray_box
 from dnerf.core.rays import Rays, Samples
 from dnerf.fields.base import RadianceField
@@ -33,27 +33,31 @@ class SurroundingsBackground(Background):
         box: (2, 3) corners of what is modelled inside.
         field: radiance field over [-2, 2]^3, see `dnerf.core.contraction.contract`.
         num_intervals: of each ray.
+        shape: of what the contraction leaves as it is, "box" or "ball".
 
     Raises:
-        ValueError: for fewer than two intervals.
+        ValueError: for fewer than two intervals, or another shape.
     """
 
     shows_beyond = True
 
-    def __init__(self, box: Sequence[Sequence[float]], field: RadianceField, num_intervals: int = 16) -> None:
+    def __init__(
+        self, box: Sequence[Sequence[float]], field: RadianceField, num_intervals: int = 16, *, shape: str = "box"
+    ) -> None:  # fmt: skip
         super().__init__()
+        check_choice("shape", shape, SHAPES)
         check_whole("num_intervals", num_intervals)
         if num_intervals < 2:
             raise ValueError(f"num_intervals must be at least 2, got {num_intervals}")
         self.field = field
-        self.num_intervals = num_intervals
+        self.num_intervals, self.shape = num_intervals, shape
         self.box = nn.Buffer(as_box(box), persistent=False)
 
     def forward(self, rays: Rays, *, generator: torch.Generator | None = None) -> Tensor:
         """Colours (R, 3); intervals are shifted at random in training."""
         samples = self._place(rays, generator)
         positions, directions, times = samples.locate(rays)
-        contracted, distances = contract(positions, self.box)
+        contracted, distances = contract(positions, self.box, self.shape)
         output = self.field(contracted, directions, times)
         lengths = samples.lengths / (0.5 * (self.box[1] - self.box[0]).max()) / distances.square()
         depths = output.density[:, :-1] * lengths[:, :-1]

@@ -13,12 +13,12 @@ from dnerf.core.schedules import Scheduled
 FRAMES_PER_EMBEDDING = 2
 
 
-class FrameTimesAware(ABC):
-    """A module that gets to know the times of the training frames before the first step."""
+class FramesAware(ABC):
+    """A module that gets to know the training frames before the first step."""
 
     @abstractmethod
-    def see(self, times: Tensor) -> None:
-        """Adapt to the times (F,) of the frames; what was learnt before stays."""
+    def see(self, times: Tensor, places: Tensor) -> None:
+        """Adapt to the frames' times (F,) and their cameras' places (F, 3) in world units; what was learnt stays."""
 
 
 class SinusoidalEncoding(nn.Module, Scheduled):
@@ -73,7 +73,7 @@ class SinusoidalEncoding(nn.Module, Scheduled):
         return [values, *waves]
 
 
-class TimeEncoding(nn.Module, FrameTimesAware):
+class TimeEncoding(nn.Module, FramesAware):
     """Waves of a time, then a learnt time embedding: features evenly spaced in time, linear in between.
 
     Waves (`SinusoidalEncoding`) are smooth and say something of all times. What happens within a frame or two, as when
@@ -107,12 +107,8 @@ class TimeEncoding(nn.Module, FrameTimesAware):
         self.out_features = self.waves.out_features + (num_features if num_embeddings else 0)
 
     @torch.no_grad()
-    def see(self, times: Tensor) -> None:
-        """Use half as many embeddings as there are frames, and at most one for each time; what they know stays.
-
-        Args:
-            times: (F,) of the frames that training has.
-        """
+    def see(self, times: Tensor, places: Tensor) -> None:
+        """Use half as many embeddings as there are frames, and at most one for each time; what they know stays."""
         if self.embeddings is None:
             return
         wanted = min(len(times) // FRAMES_PER_EMBEDDING, len(times.unique()), len(self.embeddings))

@@ -131,12 +131,14 @@ class HeldOut:
 
 
 def split_frames(frames: Frames) -> tuple[Frames, Frames] | None:
-    """Frames to train on and frames to compare on, evenly spread in time; None if there are too few."""
+    """Frames to train on and frames to compare on, spread in time and over the cameras of a rig; None for too few."""
     if len(frames) < LEAST_FRAMES:
         return None
     every = round(1 / HELD_SHARE)
     order = frames.times.argsort(stable=True).tolist()
-    held = order[every // 2 :: every]
+    # One of each eight, another each time: of four cameras that take turns, every eighth frame is the same one's.
+    places = (start + (every // 2 + 3 * (start // every)) % every for start in range(0, len(order), every))
+    held = [order[place] for place in places if place < len(order)]
     return frames.subset([i for i in range(len(frames)) if i not in set(held)]), frames.subset(held)
 
 

@@ -1,38 +1,61 @@
-"""Exposure and white balance that drift through a film, which are the camera's, not the scene's."""
+"""Exposure and white balance that differ between cameras or drift through a film, which are not the scene's."""
 
 import torch
 from torch import Tensor, nn
 
 from dnerf.core.checks import check_whole
+from dnerf.core.geometry import distinct_places
+from dnerf.nn.encodings import FramesAware
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
+SAME_PLACE = 0.03  # of the distance of the outermost camera from all cameras' middle
 
-class Exposure(nn.Module, DeclaresGroups):
-    """Factors `exp(e(t) - mean e)` of red, green and blue, with e learnt at even times and linear between them.
 
-    They begin at 1. Their geometric mean over those times stays 1, since the scene could be brighter instead.
+class Exposure(nn.Module, DeclaresGroups, FramesAware):
+    """Factors `exp(e(c, t) - mean e)` of red, green and blue, with e learnt at even times and linear between them.
+
+    Each camera c of a rig, from whose place there are several frames, has factors of its own. The frames of a camera
+    that moves share them. They begin at 1. Their geometric mean stays 1, since the scene could be brighter instead.
+
+    Source: the affine colours of each image in Urban Radiance Fields (arXiv 2111.14643), here a diagonal in time.
 
     Args:
         num_times: at which factors are learnt. Frames that are closer together share them.
+        most_cameras: that a rig has; more places are those of a camera that moves.
 
     Raises:
-        ValueError: for fewer than two times.
+        ValueError: for fewer than two times, or no camera.
     """
 
-    def __init__(self, num_times: int = 32) -> None:
+    def __init__(self, num_times: int = 32, most_cameras: int = 16) -> None:
         super().__init__()
-        check_whole("num_times", num_times)
+        for name, count in (("num_times", num_times), ("most_cameras", most_cameras)):
+            check_whole(name, count)
         if num_times < 2:
             raise ValueError(f"num_times must be at least 2, got {num_times}")
-        self.logarithms = nn.Parameter(torch.zeros(num_times, 3))
+        self.logarithms = nn.Parameter(torch.zeros(most_cameras, num_times, 3))
+        self.places = nn.Buffer(torch.full((most_cameras, 3), torch.inf))  # of cameras in use, in world units
+        self.is_used = nn.Buffer((torch.arange(most_cameras) == 0).float())
 
-    def forward(self, rgb: Tensor, times: Tensor) -> Tensor:
-        """What the camera shows of colours (R, 3) at times (R,) in [0, 1]."""
-        places = times * (len(self.logarithms) - 1)
-        before = places.detach().long().clamp(0, len(self.logarithms) - 2)
-        centered = self.logarithms - self.logarithms.mean(0)
+    def see(self, times: Tensor, places: Tensor) -> None:
+        """Find the cameras of a rig, see `FramesAware.see`; those that are known stay."""
+        if bool(self.places.isfinite().any()):
+            return
+        spread = (places - places.mean(0)).norm(dim=-1).max()
+        found = distinct_places(places, SAME_PLACE * float(spread), len(self.places))
+        if len(found) <= len(self.places) and 2 * len(found) <= len(places):
+            self.places[: len(found)] = found.to(self.places)
+            self.is_used[: len(found)] = 1
+
+    def forward(self, rgb: Tensor, origins: Tensor, times: Tensor) -> Tensor:
+        """What cameras at origins (R, 3) show of colours (R, 3) at times (R,) in [0, 1]."""
+        cameras = (origins[:, None] - self.places).square().sum(-1).argmin(1)
+        mean = (self.is_used[:, None, None] * self.logarithms).mean(1).sum(0) / self.is_used.sum()
+        centered = self.logarithms - mean
+        places = times * (centered.shape[1] - 1)
+        before = places.detach().long().clamp(0, centered.shape[1] - 2)
         share = (places - before)[:, None]
-        return rgb * torch.lerp(centered[before], centered[before + 1], share).exp()
+        return rgb * torch.lerp(centered[cameras, before], centered[cameras, before + 1], share).exp()
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group, "exposure"."""

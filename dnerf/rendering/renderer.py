@@ -48,7 +48,7 @@ class Renderer(nn.Module):
             colours by at most as much, and by as much again for each interval that a sampler which subdivides leaves
             out since its weight is as small; 0 to evaluate the field everywhere. Without effect on other quadratures
             than the constant one, whose intervals do not depend on their neighbours.
-        exposure: of the training images' camera, in training mode; images show the scene without it. None for none.
+        exposure: of the training images' cameras, in training mode; images show the scene without it. None for none.
 
     Raises:
         ValueError: for another precision or quadrature, one that reads densities at points of a field that knows
@@ -128,7 +128,7 @@ class Renderer(nn.Module):
     def _exposed(self, rendering: Rendering, rays: Rays) -> Rendering:
         if self.exposure is None or not self.training:
             return rendering
-        return replace(rendering, rgb=self.exposure(rendering.rgb, rays.times))
+        return replace(rendering, rgb=self.exposure(rendering.rgb, rays.origins, rays.times))
 
     def behind(self, rays: Rays, opacity: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Colours (R, 3) behind rays of such opacity (R,); black where a costly background could not be seen."""

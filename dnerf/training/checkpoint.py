@@ -26,12 +26,9 @@ def encode_run(run: Run, data: str) -> bytes:
         for key, value in run.optimizer.state.get(parameter, {}).items()
     }
     facts = {
-        "format": FORMAT,
-        "device": run.generator.device.type,
-        **{name: getattr(run, name) for name in NUMBERS},
-        "record": None if run.last_record is None else vars(run.last_record),
-        "data": data,
-    }
+        "format": FORMAT, "device": run.generator.device.type, **{name: getattr(run, name) for name in NUMBERS},
+        "record": None if run.last_record is None else vars(run.last_record), "data": data,
+    }  # fmt: skip
     return encode({**_fixed(run), **moments, **_random_states(run)}, facts)
 
 

@@ -69,20 +69,14 @@ def make_renderer(
         chance_weight=0.02, filter_joins=2,
     )  # fmt: skip
     return Renderer(
-        DeformedField(CachedDeformation(deformation, corners), field),
-        sampler,
-        RandomBackground("white") if background is None else background,
-        precision="bfloat16",
-        stop_transmittance=4e-3,
-    )
+        DeformedField(CachedDeformation(deformation, corners), field), sampler,
+        RandomBackground("white") if background is None else background, precision="bfloat16", stop_transmittance=4e-3,
+    )  # fmt: skip
 
 
 def make_trainer(
-    *,
-    max_seconds: float | None = None,
-    num_steps: int = 200_000,
-    callbacks: Mapping[str, Callback] | None = None,
-) -> Trainer:
+    *, max_seconds: float | None = None, num_steps: int = 200_000, callbacks: Mapping[str, Callback] | None = None,
+) -> Trainer:  # fmt: skip
     """The trainer of `experiment=fast`, for a renderer of `make_renderer`.
 
     A term that another model cannot have may be taken out before training: `del trainer.losses["time_embedding"]`.
@@ -96,12 +90,9 @@ def make_trainer(
         ValueError: for numbers out of range.
     """
     losses = {
-        "rgb": PhotometricLoss(),
-        "elastic": ElasticLoss(),
-        "appearance_constancy": AppearanceConstancyLoss(),
-        "unseen_space": UnseenSpaceLoss(),
-        "time_embedding": TimeEmbeddingLoss(),
-    }
+        "rgb": PhotometricLoss(), "elastic": ElasticLoss(), "appearance_constancy": AppearanceConstancyLoss(),
+        "unseen_space": UnseenSpaceLoss(), "time_embedding": TimeEmbeddingLoss(),
+    }  # fmt: skip
     optimizer = AdamSettings(
         {"default": 2e-2, "deformation": 6e-3, "deformation_output": 1.5e-3, "head": 5e-3},
         weight_decays={"features": 1e-8}, final_rate=0.05, hold_until=0.3, warmup_steps=20, betas=(0.9, 0.99),

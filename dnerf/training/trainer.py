@@ -17,7 +17,7 @@ from dnerf.core.checks import check_positive, check_whole
 from dnerf.data.frames import Frames
 from dnerf.data.pixel_samplers import FrameSubset, PixelSampler, UniformPixels
 from dnerf.losses import Loss, PhotometricLoss
-from dnerf.nn.encodings import FrameTimesAware
+from dnerf.nn.encodings import FramesAware
 from dnerf.rendering.cuda_graphs import GraphCache
 from dnerf.rendering.renderer import Renderer, has_fixed_capacity
 from dnerf.samplers import Capacity
@@ -141,8 +141,8 @@ class Trainer:
         self._check(run)
         renderer.train()
         for part in renderer.modules():
-            if isinstance(part, FrameTimesAware):
-                part.see(run.frames.times)
+            if isinstance(part, FramesAware):
+                part.see(run.frames.times, run.frames.poses[:, :3, 3])
         self.pixels.begin(run.frames)
         warm_up(renderer, run.frames)
         return run

@@ -19,14 +19,9 @@ from dnerf.visualization.views import View
 
 # The arrays that each output is made of.
 LAYERS: dict[str, tuple[str, ...]] = {
-    "rgb": ("rgb",),
-    "depth": ("depth", "opacity"),
-    "opacity": ("opacity",),
-    "motion": ("motion",),
-    "deformation": ("deformation", "opacity"),
-    "normals": ("normals", "opacity"),
-    "compare": ("rgb", "truth"),
-}
+    "rgb": ("rgb",), "depth": ("depth", "opacity"), "opacity": ("opacity",), "motion": ("motion",),
+    "deformation": ("deformation", "opacity"), "normals": ("normals", "opacity"), "compare": ("rgb", "truth"),
+}  # fmt: skip
 
 OUTPUTS = tuple(LAYERS)
 

@@ -2,8 +2,11 @@
 
 import pytest
 import torch
+from torch import Tensor
 
-from dnerf.evaluation.error_kinds import KINDS, error_shares, kinds_of
+from dnerf.core.compositing import FieldOutput
+from dnerf.evaluation.error_kinds import KINDS, SeenFromAside, error_shares, kinds_of
+from dnerf.fields import RadianceField
 
 
 def test_kinds_of_a_square_with_stripes_on_one_side() -> None:
@@ -20,8 +23,36 @@ def test_kinds_of_a_square_with_stripes_on_one_side() -> None:
     assert torch.equal(kinds == KINDS.index("outside"), ~grown)
 
 
+class Shiny(RadianceField):
+    """Red as a direction's x, and denser with time."""
+
+    def density(self, positions: Tensor, times: Tensor) -> Tensor:
+        return times
+
+    def forward(self, positions: Tensor, directions: Tensor, times: Tensor) -> FieldOutput:
+        return FieldOutput(times, directions)
+
+
+def test_from_aside_directions_are_turned_and_nothing_else() -> None:
+    field, directions, times = SeenFromAside(Shiny()), torch.eye(3), torch.tensor([0.1, 0.2, 0.3])
+    for seen in (field, field.at_time(0.5)):
+        output = seen(torch.zeros(3, 3), directions, times)
+        expected = torch.tensor([[0.75**0.5, 0.5, 0], [-0.5, 0.75**0.5, 0], [0, 0, 1]])
+        torch.testing.assert_close(output.rgb, expected)
+        assert torch.equal(output.density, times)
+
+
+def test_inner_places_that_change_with_the_direction_are_gloss() -> None:
+    alpha, change = torch.zeros(12, 20), torch.zeros(12, 20)
+    alpha[:, :10] = 1
+    change[:, ::2] = 0.05
+    kinds = kinds_of(torch.zeros(12, 20, 3), alpha, change)
+    names = [KINDS[k] for k in kinds[6].tolist()]
+    assert names == ["gloss", "smooth"] * 4 + ["silhouettes"] * 4 + ["outside"] * 8
+
+
 def test_shares_are_of_the_whole_error_and_of_all_pixels() -> None:
-    errors, kinds = torch.tensor([[1.0, 3.0], [0.0, 4.0]]), torch.tensor([[0, 1], [3, 1]])
+    errors, kinds = torch.tensor([[1.0, 3.0], [0.0, 4.0]]), torch.tensor([[0, 2], [4, 2]])
     shares = error_shares(errors, kinds)
     assert list(shares) == list(KINDS)
     assert shares["silhouettes"] == pytest.approx((1 / 8, 1 / 4))

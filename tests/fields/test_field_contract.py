@@ -20,7 +20,6 @@ from dnerf.fields import (
     PlanesField,
     RadianceField,
     SDFField,
-    SpaceTimeVolumes,
     VolSDFField,
     VoxelField,
 )
@@ -51,24 +50,15 @@ def small_grid(**options: Any) -> GridField:
     return GridField(box, (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1, **options)
 
 
-def small_space_time(view_degree: int | None = None) -> GridField:
-    box = [[-1, -1.5, -1], [1, 1.5, 2]]
-    volumes = SpaceTimeVolumes(box, (4, 8), (3, 5), num_features=2)
-    return GridField(
-        box, (4, 9), 2, max_rows=64, hidden_features=16, num_layers=1, temporal_terms=3, space_time=volumes,
-        view_degree=view_degree,
-    )  # fmt: skip
-
-
 def small_planes(num_times: int | None = 3, view_degree: int | None = None, join: str = "product") -> PlanesField:
     planes = PlaneFeatures([[-1, -1.5, -1], [1, 1.5, 2]], (4, 9), num_times, num_features=2, join=join)
     return PlanesField(planes, hidden_features=16, num_layers=1, view_degree=view_degree)
 
 
-def small_ambient() -> GridField:
+def small_ambient(view_degree: int | None = None) -> GridField:
     ambient = AmbientCoordinates(2, hidden_features=16, num_layers=1)
     ambient.encode.set_progress(1.0)
-    return small_grid(space_time=ambient)
+    return small_grid(space_time=ambient, view_degree=view_degree)
 
 
 def small_sdf(kind: type[SDFField], view_degree: int | None = None) -> SDFField:
@@ -82,8 +72,7 @@ FIELDS = {
     "nerf, view-dependent": Case(lambda: small_nerf(view_dependent=True), view_dependent=True),
     "grid": Case(small_grid), "grid, changing": Case(lambda: small_grid(temporal_terms=3)),
     "grid, changing and view-dependent": Case(lambda: small_grid(view_degree=2, temporal_terms=3), True),
-    "grid, space-time": Case(small_space_time),
-    "grid, space-time and view-dependent": Case(lambda: small_space_time(2), True),
+    "grid, ambient and view-dependent": Case(lambda: small_ambient(2), True),
     "grid, view-dependent": Case(lambda: small_grid(view_degree=2), True),
     "planes": Case(small_planes), "planes of space": Case(lambda: small_planes(None)),
     "planes, view-dependent": Case(lambda: small_planes(3, 2), True), "grid, ambient": Case(small_ambient),

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dnerf.core.spherical_harmonics import spherical_harmonics
-from dnerf.fields import GridField, SpaceTimeVolumes
+from dnerf.fields import GridField, PlaneFeatures
 from dnerf.fields.base import warn_of_generic_path
 from dnerf.fields.grid import GridFieldAtTime
 from dnerf.kernels import grid_network, shade
@@ -217,7 +217,7 @@ def test_tables_for_the_frame_kernel_are_all_that_the_field_shows(options: dict)
 
 @pytest.mark.parametrize(("options", "part"), [
     ({"num_layers": 0}, "num_layers=0"),
-    ({"space_time": SpaceTimeVolumes(BOX, (4,), (3,))}, "space_time features"),
+    ({"space_time": PlaneFeatures(BOX, (4,), 3)}, "space_time features"),
 ])  # fmt: skip
 def test_parts_that_the_frame_kernel_does_not_serve_are_named_once(
     options: dict, part: str, caplog: pytest.LogCaptureFixture
@@ -229,10 +229,10 @@ def test_parts_that_the_frame_kernel_does_not_serve_are_named_once(
 
 
 def test_what_is_no_level_is_seen_whatever_the_window() -> None:
-    volumes = SpaceTimeVolumes(BOX, (4,), (3,), num_features=2)
+    planes = PlaneFeatures(BOX, (4,), 3, num_features=2)
     positions = torch.rand(30, 3) + torch.tensor([0.0, 0.0, 3.0])
-    field = small(window_end=1.0, space_time=volumes)
-    for table in volumes.tables:
+    field = small(window_end=1.0, space_time=planes)
+    for table in planes.tables:
         torch.nn.init.normal_(table)
     field.set_progress(0.0)
     first, last = (field.density(positions, torch.full((30,), time)) for time in (0.1, 0.8))

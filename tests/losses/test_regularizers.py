@@ -12,7 +12,7 @@ from dnerf.core.backgrounds import RandomBackground
 from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.rays import Samples
 from dnerf.deformations import Deformation, DisplacementDeformation, IdentityDeformation
-from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes, VoxelField
+from dnerf.fields import DeformedField, GridField, PlaneFeatures, RadianceField, VoxelField
 from dnerf.losses import Batch, DistortionLoss, PhotometricLoss, SmoothnessLoss, TimeEmbeddingLoss, UnseenSpaceLoss
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import StratifiedSampler
@@ -209,16 +209,16 @@ def test_unseen_space_needs_a_deformed_field_and_a_sampler_that_knows_cells() ->
         loss.check(Renderer(renderer.field, StratifiedSampler(4)))
 
 
-def test_rough_volumes_cost() -> None:
-    volumes = SpaceTimeVolumes(BOX, (4,), (1,))
-    field = DeformedField(IdentityDeformation(), GridField(BOX, (4,), 2, space_time=volumes))
+def test_rough_planes_cost() -> None:
+    planes = PlaneFeatures(BOX, (4,), 1)
+    field = DeformedField(IdentityDeformation(), GridField(BOX, (4,), 2, space_time=planes))
     renderer, rgb = Renderer(field, StratifiedSampler(4)), torch.zeros(2, 3)
     SmoothnessLoss().check(renderer)
-    in_space, in_time = (float(x.detach()) for x in volumes.roughness())
+    in_space, in_time = (float(x.detach()) for x in planes.roughness())
     assert in_space > 0 == in_time  # two times have no second difference
     loss = SmoothnessLoss(time_weight=7.0)(shown(rgb), of(rgb), renderer)
     assert loss.item() == pytest.approx(in_space)
-    assert torch.autograd.grad(loss, volumes.tables[0])[0].abs().sum() > 0
+    assert torch.autograd.grad(loss, planes.tables[0])[0].abs().sum() > 0
     with pytest.raises(ValueError, match="SmoothnessLoss needs a field with a part of `HasRoughness`"):
         SmoothnessLoss().check(RENDERER)
     with pytest.raises(ValueError, match="time_weight must be >= 0"):

@@ -9,6 +9,8 @@ from reference import sinusoidal
 
 from dnerf.nn.encodings import SinusoidalEncoding, TimeEncoding
 
+PLACES = torch.zeros(1, 3)  # of cameras, which do not matter here
+
 
 @pytest.mark.parametrize("num_dims", [1, 3])
 @pytest.mark.parametrize("num_frequencies", [0, 1, 10])
@@ -94,7 +96,7 @@ def test_embeddings_say_nothing_until_they_have_learnt() -> None:
 ])  # fmt: skip
 def test_half_as_many_embeddings_as_frames_are_used(times: torch.Tensor, expected: int) -> None:
     encoding = TimeEncoding(3, 100, 2).double()
-    encoding.see(times)
+    encoding.see(times, PLACES)
     assert encoding.num_used.item() == expected
     few = with_embeddings(expected)
     with torch.no_grad():
@@ -112,12 +114,12 @@ def test_half_as_many_embeddings_as_frames_are_used(times: torch.Tensor, expecte
 
 def test_what_embeddings_have_learnt_stays_with_more_frames_and_with_fewer() -> None:
     encoding, instants = TimeEncoding(3, 100, 2).double(), torch.linspace(-0.1, 1.1, 200, dtype=torch.float64)[:, None]
-    encoding.see(torch.linspace(0, 1, 50))
+    encoding.see(torch.linspace(0, 1, 50), PLACES)
     with torch.no_grad():
         encoding.embeddings.copy_(torch.randn(100, 2))
     before = encoding(instants)
     for num_frames, expected in ((98, 49), (10, 49), (1, 49), (400, 100)):  # 49: every second where one was
-        encoding.see(torch.linspace(0, 1, num_frames))
+        encoding.see(torch.linspace(0, 1, num_frames), PLACES)
         assert encoding.num_used.item() == expected
         if expected == 49:
             torch.testing.assert_close(encoding(instants), before, rtol=0, atol=1e-12)
@@ -125,7 +127,7 @@ def test_what_embeddings_have_learnt_stays_with_more_frames_and_with_fewer() -> 
 
 def test_without_embeddings_there_is_nothing_to_tell() -> None:
     encoding = TimeEncoding(3)
-    encoding.see(torch.linspace(0, 1, 50))
+    encoding.see(torch.linspace(0, 1, 50), PLACES)
     assert encoding.state_dict() == {}
 
 

@@ -99,6 +99,10 @@ def test_split_holds_every_eighth_frame_out_and_none_of_few() -> None:
     assert (len(learnt), len(held)) == (21, 3)
     assert not set(learnt.times.tolist()) & set(held.times.tolist())
     assert split_frames(small_frames(7)) is None
+    rig = replace(small_frames(64), times=torch.linspace(0, 1, 16).repeat(4))  # four cameras, one after the other
+    held = split_frames(rig)[1]  # type: ignore[index]
+    seen = [(rig.poses == pose).flatten(1).all(1).nonzero()[0].item() // 16 for pose in held.poses]
+    assert sorted(seen) == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def make(choices: Mapping[str, str]) -> tuple[Renderer, Trainer]:

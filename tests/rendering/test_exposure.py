@@ -1,4 +1,4 @@
-"""A camera's drifting exposure is learnt apart from the scene, and is not in images."""
+"""Exposures of cameras are learnt apart from the scene, and are not in images."""
 
 import math
 
@@ -7,23 +7,26 @@ import torch
 from torch import nn
 
 from dnerf.core.cameras import Camera, Intrinsics, look_at
+from dnerf.data import film_by_rig
 from dnerf.rendering import Exposure, Renderer
 from dnerf.samplers import StratifiedSampler
 from dnerf.scenes import make_scene
 
 TIMES = torch.linspace(0, 1, 41)
+ORIGINS = torch.zeros(41, 3)
+RIG = torch.tensor([[0.0, 0, 3], [3, 0, 0], [0, 3, 0]])
 
 
 def drifting(factors: list[list[float]]) -> Exposure:
     exposure = Exposure(len(factors))
-    exposure.logarithms.data.copy_(torch.tensor(factors).log())
+    exposure.logarithms.data[0] = torch.tensor(factors).log()
     return exposure
 
 
 def test_colours_are_as_they_are_at_first_and_gradients_flow() -> None:
     exposure, rgb = Exposure(), torch.rand(41, 3)
-    torch.testing.assert_close(exposure(rgb, TIMES), rgb, rtol=0, atol=0)
-    (exposure(rgb, TIMES) * (TIMES[:, None] - 0.5)).sum().backward()
+    torch.testing.assert_close(exposure(rgb, ORIGINS, TIMES), rgb, rtol=0, atol=0)
+    (exposure(rgb, ORIGINS, TIMES) * (TIMES[:, None] - 0.5)).sum().backward()
     assert exposure.logarithms.grad is not None
     assert float(exposure.logarithms.grad.abs().max()) > 0.1
 
@@ -31,25 +34,26 @@ def test_colours_are_as_they_are_at_first_and_gradients_flow() -> None:
 def test_logarithms_of_factors_are_linear_between_times() -> None:
     exposure = drifting([[2.0, 1.0, 0.5], [1.0, 1.0, 1.0], [0.5, 1.0, 2.0]])
     for time, factors in ((0.0, (2, 1, 0.5)), (0.25, (2**0.5, 1, 2**-0.5)), (0.5, (1, 1, 1)), (1.0, (0.5, 1, 2))):
-        shown = exposure(torch.full((1, 3), 0.4), torch.tensor([time]))
+        shown = exposure(torch.full((1, 3), 0.4), torch.zeros(1, 3), torch.tensor([time]))
         torch.testing.assert_close(shown, 0.4 * torch.tensor([factors]), rtol=1e-6, atol=0)
 
 
 def test_brightness_as_a_whole_is_the_scene_s() -> None:
     factors = torch.rand(7, 3) + 0.5
-    shown, brighter = (drifting(x.tolist())(torch.full((41, 3), 0.5), TIMES) for x in (factors, 3 * factors))
+    shown, brighter = (drifting(x.tolist())(torch.full((41, 3), 0.5), ORIGINS, TIMES) for x in (factors, 3 * factors))
     torch.testing.assert_close(shown, brighter)
 
 
 def test_its_derivatives_are_right() -> None:
-    exposure = Exposure(4).double()
+    exposure = Exposure(4, 2).double()
+    exposure.see(torch.linspace(0, 1, 8), RIG[[0, 1] * 4])
     rgb = torch.rand(9, 3, dtype=torch.float64, requires_grad=True)
-    times = torch.linspace(0.01, 0.97, 9, dtype=torch.float64)
+    times, origins = torch.linspace(0.01, 0.97, 9, dtype=torch.float64), RIG[[0, 1, 1] * 3].double()
 
     def shown(rgb: torch.Tensor, logarithms: torch.Tensor) -> torch.Tensor:
-        return torch.func.functional_call(exposure, {"logarithms": logarithms}, (rgb, times))
+        return torch.func.functional_call(exposure, {"logarithms": logarithms}, (rgb, origins, times))
 
-    assert torch.autograd.gradcheck(shown, (rgb, torch.rand(4, 3, dtype=torch.float64, requires_grad=True)))
+    assert torch.autograd.gradcheck(shown, (rgb, torch.rand(2, 4, 3, dtype=torch.float64, requires_grad=True)))
 
 
 def test_a_drift_is_found_beside_colours_that_are_learnt_too() -> None:
@@ -59,11 +63,11 @@ def test_a_drift_is_found_beside_colours_that_are_learnt_too() -> None:
     optimizer = torch.optim.Adam([*exposure.parameters(), learnt], lr=0.01)
     for _ in range(600):
         optimizer.zero_grad()
-        shown = torch.stack([exposure(color.expand(41, 3), TIMES) for color in learnt])
+        shown = torch.stack([exposure(color.expand(41, 3), ORIGINS, TIMES) for color in learnt])
         (shown - colors[:, None] * truth).square().mean().backward()
         optimizer.step()
     scale = learnt.detach() / colors
-    found = exposure(torch.ones(41, 3), TIMES).detach()
+    found = exposure(torch.ones(41, 3), ORIGINS, TIMES).detach()
     torch.testing.assert_close(found * scale.mean(), truth.expand(41, 3), rtol=0.02, atol=0)
     torch.testing.assert_close(scale, scale.mean().expand(8, 3), rtol=0.02, atol=0)
 
@@ -78,6 +82,41 @@ def test_it_is_in_training_and_not_in_images() -> None:
     torch.testing.assert_close(seen[0], seen[1] * torch.tensor([2.0, 1.0, 0.5]))
 
 
-def test_one_time_is_refused() -> None:
-    with pytest.raises(ValueError, match="num_times must be at least 2, got 1"):
-        Exposure(1)
+def seen(places: torch.Tensor) -> Exposure:
+    exposure = Exposure(2, 4)
+    exposure.see(torch.linspace(0, 1, len(places)), places)
+    return exposure
+
+
+def test_each_camera_of_a_rig_has_factors_of_its_own_whose_mean_is_one() -> None:
+    exposure = seen(RIG[[0, 1, 2] * 5] + 0.01 * torch.rand(15, 3))
+    exposure.logarithms.data[:3] = torch.tensor([2.0, 1.0, 0.5]).log()[:, None, None]
+    order = [int(exposure.places[:3].isclose(place, atol=0.02).all(1).nonzero()) for place in RIG]
+    shown = exposure(torch.ones(3, 3), RIG, torch.tensor([0.0, 0.3, 1.0]))
+    torch.testing.assert_close(shown, torch.tensor([2.0, 1.0, 0.5])[order][:, None].expand(3, 3))
+    kept = exposure.places.clone()
+    exposure.see(TIMES, torch.rand(41, 3))
+    assert torch.equal(exposure.places, kept)
+
+
+def test_the_cameras_of_a_film_by_a_rig_are_found_and_exposed_differently() -> None:
+    frames = film_by_rig(make_scene("courtyard"), 16, num_cameras=3, num_train=4, num_test=2)
+    exposure = seen(frames["train"].poses[:, :3, 3])
+    assert int(exposure.is_used.sum()) == 3
+    still = [frames["train"].image(i).mean() for i in (0, 4, 8)]  # of each camera
+    assert still[1] < 0.9 * still[0]  # 0.35 cos 2.4 of a stop, and 0.35
+    assert len(frames["test"].poses.unique(dim=0)) == 1
+
+
+@pytest.mark.parametrize("places", [torch.rand(41, 3), RIG, torch.zeros(8, 3)])
+def test_a_camera_that_moves_or_is_alone_is_one(places: torch.Tensor) -> None:
+    exposure = seen(places)
+    exposure.logarithms.data[0, :, 0] = torch.tensor([4.0, 1.0]).log()
+    shown = exposure(torch.ones(2, 3), torch.rand(2, 3), torch.tensor([0.0, 1.0]))
+    torch.testing.assert_close(shown, torch.tensor([[2.0, 1, 1], [0.5, 1, 1]]))
+
+
+@pytest.mark.parametrize(("numbers", "said"), [((1, 4), "num_times must be at least 2"), ((2, 0), "most_cameras")])
+def test_too_few_are_refused(numbers: tuple[int, int], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Exposure(*numbers)

@@ -15,7 +15,7 @@ from dnerf.core.compositing import FieldOutput, Rendering
 from dnerf.core.rays import Rays, Samples
 from dnerf.deformations import CachedDeformation, DisplacementDeformation, IdentityDeformation
 from dnerf.deformations.cached import CachedAtTime
-from dnerf.fields import DeformedField, GridField, RadianceField, SpaceTimeVolumes
+from dnerf.fields import DeformedField, GridField, PlaneFeatures, RadianceField
 from dnerf.fields.base import warn_of_generic_path
 from dnerf.kernels.cpu.dense import has_vectors
 from dnerf.kernels.trace_network import trace_network
@@ -130,15 +130,15 @@ def test_rays_that_the_kernel_cannot_follow_are_rendered_all_the_same(fused: lis
 
 @vectors
 def test_the_kernel_is_used_only_for_what_it_was_made_for(fused: list[Tensor]) -> None:
-    volumes = SpaceTimeVolumes(BOX, (3,), (2,), num_features=2)
-    for renderer in (model(precision="float32"), model(space_time=volumes), model(stop=0.0)):
+    planes = PlaneFeatures(BOX, (3,), 2, num_features=2)
+    for renderer in (model(precision="float32"), model(space_time=planes), model(stop=0.0)):
         image(renderer)
     assert not fused
 
 
 @vectors
 @pytest.mark.parametrize(("options", "part"), [
-    ({"space_time": SpaceTimeVolumes(BOX, (3,), (2,), num_features=2)}, "space_time features"),
+    ({"space_time": PlaneFeatures(BOX, (3,), 2, num_features=2)}, "space_time features"),
     ({"hidden_features": 12}, r"layers of widths [8, 12, 12, 4]"),
 ])  # fmt: skip
 def test_parts_that_keep_a_model_from_the_kernel_are_named(

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from dnerf.core.geometry import move_by_twists, so3_exp
 from dnerf.core.spherical_harmonics import spherical_harmonics
 from dnerf.deformations import DisplacementDeformation
-from dnerf.fields import DeformedField, GridField, NeRFField, SpaceTimeVolumes
+from dnerf.fields import DeformedField, GridField, NeRFField, PlaneFeatures
 from dnerf.fields.activations import activate_density
 from dnerf.kernels import GridLevels, grid_encode, use_backend
 from dnerf.nn.encodings import SinusoidalEncoding
@@ -21,7 +21,7 @@ FIELDS = {
     "nerf": lambda: NeRFField(4, 64, (2,), view_dependent=True),
     "grid": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, view_degree=3, temporal_terms=4),
     "grid, changing": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, temporal_terms=4),
-    "grid, space-time": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, space_time=SpaceTimeVolumes(BOX)),
+    "grid, space-time": lambda: GridField(BOX, (8, 16, 64), 8, max_rows=4096, space_time=PlaneFeatures(BOX, (24, 48))),
     "deformed": lambda: DeformedField(moving(), GridField(BOX, (8, 16), 8)),
 }
 

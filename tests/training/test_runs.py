@@ -69,7 +69,7 @@ def test_a_config_becomes_objects_and_stays_as_it_is() -> None:
         ({"_args_": [1]}, "renderer.field._args_ is none of GridField's arguments"),
         ({"box": None}, "renderer.field"),
         ({"resolutions": 3}, "renderer.field: 'int' object is not iterable"),
-        ({"space_time": {"_target_": "dnerf.fields.SpaceTimeVolumes"}}, "renderer.field.space_time.box is missing"),
+        ({"space_time": {"_target_": "dnerf.fields.PlaneFeatures"}}, "renderer.field.space_time.box is missing"),
     ],
 )
 def test_an_error_names_its_place(change: dict[str, Any], said: str) -> None:
