@@ -128,13 +128,13 @@ def test_fork_continues_from_the_same_weights_and_moments() -> None:
 
 
 def test_contest_finds_the_candidate_that_learns_and_keeps_the_standing_one_of_equals() -> None:
-    learnt, held = split_frames(small_frames(24))  # type: ignore[misc]
+    learnt, held = split_frames(small_frames(40))  # type: ignore[misc]
     pixels = HeldOut.of(held, 0)
 
     def contenders(*rates: str) -> list[Contender]:
         return [Contender.fresh(rate, make, {"rate": rate}, learnt, 0) for rate in rates]
 
-    result = contest(contenders("slow", "quick", "worse"), pixels, Effort(40, 0.0))
+    result = contest(contenders("slow", "quick", "worse"), pixels, Effort(160, 0.0))
     assert result.winner.choice == "quick"
     assert result.gain > 2 * result.error > 0
     assert contest(contenders("slow", "slow"), pixels, Effort(10, 0.0)).winner.choice == "slow"
@@ -170,13 +170,13 @@ def part(**changes: object) -> Part:
 
 
 def test_trial_decides_and_its_winner_is_trained_on() -> None:
-    plan, run = make_plan({"rate": part()}, {}, make, small_frames(24), BOX, share=0.05)
+    plan, run = make_plan({"rate": part()}, {}, make, small_frames(40), BOX, share=0.2)
     decision = plan.decisions["rate"]
     assert (decision.choice, decision.by) == ("quick", "trial")
     assert run is not None
     assert run.step >= 80 + LEAST_STEPS
     renderer, trainer = make(plan.choices)
-    record = trainer.fit(run.renderer, small_frames(24), begun=run)
+    record = trainer.fit(run.renderer, small_frames(40), begun=run)
     assert record.step == 800
     assert run.renderer is not renderer
 
@@ -189,7 +189,7 @@ def test_candidates_are_made_without_what_does_not_arise_with_them() -> None:
         return make(choices)
 
     richer = Part("what else", CANDIDATES, "quick", at=0.3, only_if={"rate": "slow"})
-    plan, run = make_plan({"rate": part(), "other": richer}, {}, noting, small_frames(24), BOX, share=0.05)
+    plan, run = make_plan({"rate": part(), "other": richer}, {}, noting, small_frames(40), BOX, share=0.4)
     assert made == [{"rate": "slow", "other": "quick"}, {"rate": "quick", "other": "slow"}]
     assert run is not None
     assert plan.choices == made[-1]  # whose run goes on
