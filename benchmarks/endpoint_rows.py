@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dnerf.core.checks import check_positive
+from dnerf.data.normalization import Similarity
 from dnerf.motion.transport import MotionModel, carry
 from dnerf.scenes import AnalyticScene
 
@@ -17,7 +18,7 @@ Row = dict[str, Any]
 def endpoint_rows(
     model: MotionModel, scene: AnalyticScene, *, time: float = 0.0,
     times: Sequence[float] = (0.1, 0.25, 0.5, 0.75, 1.0), num_points: int = 4096, depth: float = 0.05,
-    min_motion: float = 0.01, seed: int = 0,
+    min_motion: float = 0.01, seed: int = 0, similarity: Similarity = Similarity(),  # noqa: B008
 ) -> list[Row]:  # fmt: skip
     """3-D end-point error of recovered motion: distance from where the scene carries a point.
 
@@ -33,6 +34,7 @@ def endpoint_rows(
         depth: in world units.
         min_motion: points that at none of `times` are so far from where they started are left out, in world units.
         seed: of the points.
+        similarity: from the scene's units to the model's.
 
     Returns:
         Rows of time, num_points, moved (mean distance that points move, the error of a model in which nothing does),
@@ -55,12 +57,12 @@ def endpoint_rows(
         if not alone.any():
             continue
         points, target = start[alone], truth[alone]
-        moved, residual = carry(model, points, time, end)
-        errors = (moved - target).norm(dim=-1)
+        moved, residual = carry(model, similarity.positions_to_world(points).to(points), time, end)
+        errors = (similarity.positions_from_world(moved) - target).norm(dim=-1)
         rows.append({
             "time": end, "num_points": len(points), "moved": float((points - target).norm(dim=-1).mean()),
             "mean_error": float(errors.mean()), "median_error": float(errors.median()),
-            "residual": float(residual.median()),
+            "residual": float(residual.median()) / similarity.scale,
         })  # fmt: skip
     if not rows:
         raise ValueError(f"scene must have points that are in one body only at one of the times {list(times)}")

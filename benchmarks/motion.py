@@ -59,10 +59,10 @@ def _overrides(settings: Settings, options: dict[str, Any], scene: str, experime
 def _measured(settings: Settings, options: dict[str, Any], scene: str, experiment: str, seed: int) -> Row:
     folder = settings.work_dir / f"{scene}-{experiment}-seed{seed}"
     trained = run_training(settings.train_command, _overrides(settings, options, scene, experiment, seed), folder)
-    model = motion_model(settings.finished(str(folder))["renderer"])
-    if model is None:
+    finished = settings.finished(str(folder))
+    if (model := motion_model(finished["renderer"])) is None:
         raise ValueError(f"motion.experiments: the motion of {experiment} is not known, it has no deformation")
-    ends = endpoint_rows(model.cpu(), make_scene(scene))
+    ends = endpoint_rows(model.cpu(), make_scene(scene), similarity=finished["data"].world().similarity)
     means = {name: fmean(row[name] for row in ends) for name in ("moved", "mean_error", "median_error", "residual")}
     return {
         "scene": scene, "experiment": experiment, "seed": seed, "steps": trained.num_steps, **means,

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.endpoint_rows import endpoint_rows, surface_points
+from dnerf.data.normalization import Similarity
 from dnerf.deformations import IdentityDeformation
 from dnerf.scenes import make_scene
 
@@ -23,6 +24,26 @@ def test_a_model_that_stands_still_is_wrong_by_the_motion() -> None:
     rows = endpoint_rows(IdentityDeformation(), scene, num_points=300, times=(0.25,))
     assert math.isclose(rows[0]["mean_error"], rows[0]["moved"], rel_tol=1e-5)
     assert rows[0]["moved"] > 0.3
+
+
+def test_errors_are_in_the_scene_s_units_whatever_the_model_s() -> None:
+    scene = make_scene("walker")
+
+    class Still(IdentityDeformation):
+        """Says where it was asked about."""
+
+        places: Tensor
+
+        def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+            self.places = positions
+            return positions
+
+    own, small = Still(), Still()
+    similarity = Similarity(0.25, center=(1.0, 2.0, 3.0))
+    rows = [endpoint_rows(own, scene, num_points=300, times=(0.25,))]
+    rows.append(endpoint_rows(small, scene, num_points=300, times=(0.25,), similarity=similarity))
+    assert rows[1][0]["mean_error"] == pytest.approx(rows[0][0]["mean_error"], rel=1e-4)
+    torch.testing.assert_close(small.places, similarity.positions_to_world(own.places).float())
 
 
 def test_points_are_in_one_body_near_its_surface() -> None:
