@@ -39,12 +39,9 @@ def commit() -> str:
 def provenance() -> dict[str, str]:
     """What every file of scores carries, as plain values."""
     return {
-        "hardware": hardware(),
-        "commit": commit(),
-        "version": __version__,
-        "torch": torch.__version__,
+        "hardware": hardware(), "commit": commit(), "version": __version__, "torch": torch.__version__,
         "kernels": os.environ.get("DNERF_KERNELS", "default"),
-    }
+    }  # fmt: skip
 
 
 def _processor() -> str:

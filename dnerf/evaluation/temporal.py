@@ -112,15 +112,12 @@ def evaluate_over_time(
     scores, floors = (_means([_exact_row(f, i, flow) for i, flow in enumerate(flows)]) for f in (film, truth))
     floor_names = ("warping_error", "depth_consistency", "flow_error")
     return TemporalScores(
-        motion="exact",
-        true_flicker=flicker(truth.images),
+        motion="exact", true_flicker=flicker(truth.images),
         temporal_psnr=min(temporal_psnr(film.images, truth.images), MAX_PSNR),
         film_psnr=fmean(min(psnr(a, b), MAX_PSNR) for a, b in zip(film.images, truth.images)),
-        **common,
-        **scores,
-        **{f"true_{name}": floors[name] for name in floor_names},
+        **common, **scores, **{f"true_{name}": floors[name] for name in floor_names},
         **_track_scores(model, camera, scene, times, flows[0]),
-    )
+    )  # fmt: skip
 
 
 def _shoot(

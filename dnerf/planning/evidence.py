@@ -113,6 +113,21 @@ class ColorsEvidence(Evidence):
         return Finding("one", f"all pixels are mixtures of the background and one colour, for {cameras} cameras")
 
 
+class ExposureEvidence(Evidence):
+    """Whether exposures differ: candidates "steady" and "drifts".
+
+    Each camera that stands still has an exposure of its own, until a trial says otherwise. Learnt later, it would find
+    shapes that had explained the differences between cameras already.
+    """
+
+    def find(self, frames: Frames, box: torch.Tensor) -> Finding | None:
+        """See `Evidence.find`; None for cameras that move, and for one alone."""
+        cameras = len(frames.poses.unique(dim=0))
+        if not 1 < cameras <= len(frames) / 2:
+            return None
+        return Finding("drifts", f"{cameras} cameras stand still, each with its own exposure", is_certain=False)
+
+
 def mixture_share(frames: Frames, behind: torch.Tensor) -> float:
     """The share of pixels that are mixtures of a colour (3,) in [0, 1] behind and one other, up to `SAME_LEVELS`."""
     images = (frames.stored_image(i)[::EVERY_PIXEL, ::EVERY_PIXEL, :3] for i in evenly_spread(len(frames), MAX_VIEWS))

@@ -53,12 +53,9 @@ class OccupancyGrid(nn.Module, HasTrainingBuffers):
     ) -> None:  # fmt: skip
         super().__init__()
         for name, value in (
-            ("resolution", resolution),
-            ("num_slabs", num_slabs),
-            ("threshold", threshold),
-            ("update_every", update_every),
-            ("num_probes", num_probes),
-        ):
+            ("resolution", resolution), ("num_slabs", num_slabs), ("threshold", threshold),
+            ("update_every", update_every), ("num_probes", num_probes),
+        ):  # fmt: skip
             check_positive(name, value)
         check_within("decay", decay, "(0, 1)")
         for name, value in (("dilation", dilation), ("render_dilation", render_dilation)):

@@ -17,15 +17,11 @@ def compile_kernels():
     grid = {"num_features": 8, "width": 8, "block": 128}
     marching = {"num_slabs": 16, "nx": 128, "ny": 128, "nz": 64, "block": 64}
     kernels = [
-        (grid_encode._forward, grid),
-        (grid_encode._grad_table, grid),
-        (grid_encode._grad_positions, grid),
-        (packed._weights, {"terms": 9, "block": 128}),
-        (packed._grad_optical_depth, {"block": 128}),
+        (grid_encode._forward, grid), (grid_encode._grad_table, grid), (grid_encode._grad_positions, grid),
+        (packed._weights, {"terms": 9, "block": 128}), (packed._grad_optical_depth, {"block": 128}),
         (packed._sums, {"weighted": True, "block": 32, "width": 4}),
-        (march._march, marching | {"fill": False}),
-        (march._march, marching | {"fill": True}),
-    ]
+        (march._march, marching | {"fill": False}), (march._march, marching | {"fill": True}),
+    ]  # fmt: skip
     kinds = {"occupancy": "*u8", "limit": "i64"} | dict.fromkeys(("num_samples", "num_levels", "num_columns"), "i32")
     kinds |= dict.fromkeys(("levels", "offsets", "ray_indices"), "*i64")
     for real in ("*fp32", "*fp64"):

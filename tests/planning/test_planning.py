@@ -17,7 +17,14 @@ from dnerf.data import Frames, SyntheticData
 from dnerf.data.bounds import fit_box
 from dnerf.fields import GridField
 from dnerf.planning import Decision, Evidence, Finding, Part, Plan, make_plan
-from dnerf.planning.evidence import ColorsEvidence, DetailEvidence, MotionEvidence, SurroundingsEvidence, mixture_share
+from dnerf.planning.evidence import (
+    ColorsEvidence,
+    DetailEvidence,
+    ExposureEvidence,
+    MotionEvidence,
+    SurroundingsEvidence,
+    mixture_share,
+)
 from dnerf.planning.plan import fingerprint, load_plan, settled
 from dnerf.planning.planner import LEAST_STEPS
 from dnerf.planning.trials import Contender, Effort, HeldOut, contest, gain, split_frames
@@ -312,6 +319,15 @@ def test_held_out_pixels_are_those_that_count() -> None:
     frames = small_frames(4)
     known = torch.arange(frames.num_pixels) % 5 > 2
     assert bool(known[HeldOut.of(replace(frames, is_known=known), 0).indices].all())
+
+
+def test_cameras_that_stand_still_have_exposures_of_their_own_until_a_trial() -> None:
+    frames = small_frames(12)
+    rig = replace(frames, poses=frames.poses[[0, 1, 2] * 4])
+    found = ExposureEvidence().find(rig, BOX)
+    assert found == Finding("drifts", "3 cameras stand still, each with its own exposure", is_certain=False)
+    for poses in (frames.poses, frames.poses[[0] * 12]):
+        assert ExposureEvidence().find(replace(frames, poses=poses), BOX) is None
 
 
 def test_what_speaks_against_a_given_choice_is_said() -> None:

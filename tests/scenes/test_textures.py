@@ -11,16 +11,11 @@ from dnerf.scenes.textures import grid_planes, sector_planes
 BLACK, WHITE = Plain((0.0, 0.0, 0.0)), Plain((1.0, 1.0, 1.0))
 BOARD = Checker(BLACK, WHITE, grid_planes(0.25, 3))
 TEXTURES: list[Texture] = [
-    WHITE,
-    Gradient((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
-    Glow((1.0, 0.5, 0.0), (0.0, 0.5, 1.0), 1.0),
-    Stripes(BLACK, WHITE, (0.0, 30.0, 0.0)),
-    BOARD,
-    Lit(WHITE),
-    Shadowed(WHITE, ((0.1, 0.2, 0.3), (0.2, 0.1, 0.3)), 1.0),
-    Glossy(Lit(WHITE), strength=1.0),
+    WHITE, Gradient((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), Glow((1.0, 0.5, 0.0), (0.0, 0.5, 1.0), 1.0),
+    Stripes(BLACK, WHITE, (0.0, 30.0, 0.0)), BOARD, Lit(WHITE),
+    Shadowed(WHITE, ((0.1, 0.2, 0.3), (0.2, 0.1, 0.3)), 1.0), Glossy(Lit(WHITE), strength=1.0),
     Glossy(BLACK, strength=1.0),
-]
+]  # fmt: skip
 
 
 def inside_unit_ball(count: int) -> tuple[torch.Tensor, torch.Tensor]:
