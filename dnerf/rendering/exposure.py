@@ -20,7 +20,7 @@ class Exposure(nn.Module, DeclaresGroups, FramesAware):
     Source: the affine colours of each image in Urban Radiance Fields (arXiv 2111.14643), here a diagonal in time.
 
     Args:
-        num_times: at which factors are learnt. Frames that are closer together share them.
+        num_times: at which factors are learnt; half as many as a camera has frames, if those are fewer.
         most_cameras: that a rig has; more places are those of a camera that moves.
 
     Raises:
@@ -35,26 +35,26 @@ class Exposure(nn.Module, DeclaresGroups, FramesAware):
             raise ValueError(f"num_times must be at least 2, got {num_times}")
         self.logarithms = nn.Parameter(torch.zeros(most_cameras, num_times, 3))
         self.places = nn.Buffer(torch.full((most_cameras, 3), torch.inf))  # of cameras in use, in world units
-        self.is_used = nn.Buffer((torch.arange(most_cameras) == 0).float())
+        self.is_used = nn.Buffer((torch.arange(most_cameras) == 0).float()[:, None, None].repeat(1, num_times, 1))
 
     def see(self, times: Tensor, places: Tensor) -> None:
-        """Find the cameras of a rig, see `FramesAware.see`; those that are known stay."""
+        """Find the cameras of a rig, and the times near which each has frames; those that are known stay."""
         if bool(self.places.isfinite().any()):
             return
         spread = (places - places.mean(0)).norm(dim=-1).max()
         found = distinct_places(places, SAME_PLACE * float(spread), len(self.places))
-        if len(found) <= len(self.places) and 2 * len(found) <= len(places):
-            self.places[: len(found)] = found.to(self.places)
-            self.is_used[: len(found)] = 1
+        if len(found) > len(self.places) or 2 * len(found) > len(places):
+            found = places[:1]
+        self.places[: len(found)] = found.to(self.places)
+        self.is_used.zero_()[: len(found), : max(len(places) // (2 * len(found)), 2)] = 1
 
     def forward(self, rgb: Tensor, origins: Tensor, times: Tensor) -> Tensor:
         """What cameras at origins (R, 3) show of colours (R, 3) at times (R,) in [0, 1]."""
         cameras = (origins[:, None] - self.places).square().sum(-1).argmin(1)
-        mean = (self.is_used[:, None, None] * self.logarithms).mean(1).sum(0) / self.is_used.sum()
-        centered = self.logarithms - mean
-        places = times * (centered.shape[1] - 1)
-        before = places.detach().long().clamp(0, centered.shape[1] - 2)
-        share = (places - before)[:, None]
+        centered = self.logarithms - (self.is_used * self.logarithms).sum((0, 1)) / self.is_used.sum()
+        last = self.is_used[0].sum().to(times) - 1
+        before = torch.minimum((times.detach() * last).clamp(min=0), last - 1).long()
+        share = (times * last - before)[:, None]
         return rgb * torch.lerp(centered[cameras, before], centered[cameras, before + 1], share).exp()
 
     def parameter_groups(self) -> list[ParameterGroup]:
