@@ -23,6 +23,6 @@ from dnerf.fields.voxels import VoxelField
 __all__ = [
     "AmbientCoordinates", "CachedField", "DeformedField", "FieldOutput", "GridField", "HasRoughness", "IntervalAware",
     "NeRFField", "NetworkTabled", "NeuSField", "NormalField", "PlaneFeatures", "PlanesField", "RadianceField",
-    "SDFField", "SignedDistance", "SurroundingsBackground", "TimeDependence", "VolSDFField",
-    "VoxelField", "evaluate_along_rays", "normals",
+    "SDFField", "SignedDistance", "SurroundingsBackground", "TimeDependence", "VolSDFField", "VoxelField",
+    "evaluate_along_rays", "normals",
 ]  # fmt: skip

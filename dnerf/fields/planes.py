@@ -62,9 +62,8 @@ class PlaneFeatures(SpaceTimeFeatures, HasRoughness):
                 f"at most {MAX_GIB}: use coarser ones"
             )
         self.levels = tuple(GridLevels.dense([[n[i], n[j], 0] for n in cells]) for i, j in self.axes)
-        self.tables = nn.ParameterList(
-            nn.Parameter(torch.empty(levels.num_rows, num_features)) for levels in self.levels
-        )
+        empty = (torch.empty(levels.num_rows, num_features) for levels in self.levels)
+        self.tables = nn.ParameterList(map(nn.Parameter, empty))
         for some, plane in zip(self.axes, self.tables, strict=True):
             nn.init.ones_(plane) if 3 in some else nn.init.uniform_(plane, 0.1, 0.5)
         self.low = nn.Buffer(corners[0], persistent=False)

@@ -10,6 +10,7 @@ from dnerf.data.background_check import SAME_LEVELS, background_color
 from dnerf.data.carving import EVERY_PIXEL, Silhouettes
 from dnerf.data.frames import Frames
 from dnerf.data.pixel_layout import evenly_spread
+from dnerf.rendering.exposure import rig_places
 
 MAX_RAYS = 1000  # of outlines
 MAX_VIEWS = 60  # evenly spread
@@ -114,18 +115,13 @@ class ColorsEvidence(Evidence):
 
 
 class ExposureEvidence(Evidence):
-    """Whether exposures differ: candidates "steady" and "drifts".
-
-    Each camera that stands still has an exposure of its own, until a trial says otherwise. Learnt later, it would find
-    shapes that had explained the differences between cameras already.
-    """
+    """Whether exposures differ: "steady" or "drifts". It stands for cameras of a rig until a trial says otherwise."""
 
     def find(self, frames: Frames, box: torch.Tensor) -> Finding | None:
         """See `Evidence.find`; None for cameras that move, and for one alone."""
-        cameras = len(frames.poses.unique(dim=0))
-        if not 1 < cameras <= len(frames) / 2:
-            return None
-        return Finding("drifts", f"{cameras} cameras stand still, each with its own exposure", is_certain=False)
+        cameras = len(rig_places(frames.poses[:, :3, 3]))
+        why = f"{cameras} cameras stand still, each with its own exposure"
+        return Finding("drifts", why, is_certain=False) if cameras > 1 else None
 
 
 def mixture_share(frames: Frames, behind: torch.Tensor) -> float:

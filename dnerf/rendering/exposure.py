@@ -9,6 +9,14 @@ from dnerf.nn.encodings import FramesAware
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup
 
 SAME_PLACE = 0.03  # of the distance of the outermost camera from all cameras' middle
+MOST = 16  # cameras of a rig
+
+
+def rig_places(places: Tensor, most: int = MOST) -> Tensor:
+    """Of frames at places (F, 3) those (C, 3) of the cameras that stand still; the first one if there are none."""
+    spread = (places - places.mean(0)).norm(dim=-1).max()
+    found = distinct_places(places, SAME_PLACE * float(spread), most)
+    return found if len(found) <= most and 2 * len(found) <= len(places) else places[:1]
 
 
 class Exposure(nn.Module, DeclaresGroups, FramesAware):
@@ -17,7 +25,7 @@ class Exposure(nn.Module, DeclaresGroups, FramesAware):
     Each camera c of a rig, from whose place there are several frames, has factors of its own. The frames of a camera
     that moves share them. They begin at 1. Their geometric mean stays 1, since the scene could be brighter instead.
 
-    Source: the affine colours of each image in Urban Radiance Fields (arXiv 2111.14643), here a diagonal in time.
+    Source: the affine colours of each image in Urban Radiance Fields (arXiv 2111.14643), here one factor a colour.
 
     Args:
         num_times: at which factors are learnt; half as many as a camera has frames, if those are fewer.
@@ -27,7 +35,7 @@ class Exposure(nn.Module, DeclaresGroups, FramesAware):
         ValueError: for fewer than two times, or no camera.
     """
 
-    def __init__(self, num_times: int = 32, most_cameras: int = 16) -> None:
+    def __init__(self, num_times: int = 32, most_cameras: int = MOST) -> None:
         super().__init__()
         for name, count in (("num_times", num_times), ("most_cameras", most_cameras)):
             check_whole(name, count)
@@ -41,10 +49,7 @@ class Exposure(nn.Module, DeclaresGroups, FramesAware):
         """Find the cameras of a rig, and the times near which each has frames; those that are known stay."""
         if bool(self.places.isfinite().any()):
             return
-        spread = (places - places.mean(0)).norm(dim=-1).max()
-        found = distinct_places(places, SAME_PLACE * float(spread), len(self.places))
-        if len(found) > len(self.places) or 2 * len(found) > len(places):
-            found = places[:1]
+        found = rig_places(places, len(self.places))
         self.places[: len(found)] = found.to(self.places)
         self.is_used.zero_()[: len(found), : max(len(places) // (2 * len(found)), 2)] = 1
 
