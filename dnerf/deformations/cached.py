@@ -1,4 +1,4 @@
-"""A deformation at one time, kept on a lattice: what a whole frame needs of it is computed once."""
+"""A deformation at fewer places: kept on a lattice for a whole frame, evaluated at knots along rays in training."""
 
 import math
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ from dnerf.deformations.base import (
     check_positions_times,
     deformation_at_time,
 )
+from dnerf.deformations.knots import between_knots
 from dnerf.kernels import GridLevels, MarchGrid, grid_encode
 
 LEAST_ROWS = 256  # fewer take matrix libraries as long
@@ -25,31 +26,45 @@ VERTICES_PER_RAY = 4  # most to evaluate around all occupied cells, instead of f
 
 
 class CachedDeformation(WrappedDeformation, PerFrame):
-    """Another deformation; frames see its displacements through a lattice.
+    """Another deformation; frames see its displacements through a lattice, training between knots along rays.
 
     A frame has one time, and displacements vary slowly in space: a lattice of them costs a few thousand evaluations,
     its samples would cost hundreds of thousands. The map is exact at vertices and linear in between, so the error
-    falls with the square of the cells' size. Only frames do so (`at_time`); called itself, it is the other deformation.
+    falls with the square of the cells' size (`at_time`). In training a ray's samples lie close together, and the other
+    deformation is evaluated at some of them, see `between_knots`; on GPUs, and in evaluation mode, at all.
 
     Args:
         deformation: world -> canonical.
         box: (2, 3) corners of the lattice, in world units; outside it the deformation itself is evaluated.
         resolution: cells along the box's longest side; cells are nearly cubes.
+        spacing: of knots in training, in world units; twice as much where no gradients are wanted. 0: at every sample.
 
     Raises:
-        ValueError: for a box that is none or a resolution that is not positive.
+        ValueError: for a box that is none, a resolution that is not positive or a negative spacing.
     """
 
-    def __init__(self, deformation: Deformation, box: Sequence[Sequence[float]], resolution: int = 64) -> None:
+    def __init__(
+        self, deformation: Deformation, box: Sequence[Sequence[float]], resolution: int = 64, *, spacing: float = 0.0
+    ) -> None:
         super().__init__(deformation)
         check_positive("resolution", resolution)
+        check_positive("spacing", spacing, allow_zero=True)
+        self.spacing = spacing
         corners = as_box(box)
         self.box = nn.Buffer(corners, persistent=False)  # which follows the deformation's precision
         self.cells = cubes(corners, resolution)
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Canonical positions (..., 3) of positions (..., 3) at times (...,), exactly."""
-        return self.deformation(positions, times)
+        """Canonical positions (..., 3) of positions (..., 3) at times (...,).
+
+        They are exact if positions or times want gradients, and where knots are not used.
+        """
+        is_exact = positions.requires_grad or times.requires_grad or positions.is_cuda or self.deformation.is_identity
+        if is_exact or not (self.training and self.spacing and positions.ndim == 2 and len(positions)):
+            return self.deformation(positions, times)
+        check_positions_times(positions, times)
+        spacing = self.spacing if torch.is_grad_enabled() else 2 * self.spacing
+        return between_knots(self.deformation, positions, times, spacing)
 
     def at_time(self, time: float, extent: Tensor | None = None) -> Deformation:
         """The lattice at a time, for what lies in a box (2, 3); the deformation itself, if nothing moves."""

@@ -17,7 +17,7 @@ from dnerf.fields.base import RadianceField, density_of_samples, evaluate_along_
 from dnerf.kernels import MarchGrid, footprints, march, march_to_size, seen_parts
 from dnerf.samplers.base import Capacity, FixedCapacity, FrontToBack, OccupancyAware, OccupiedCells, Sampler
 from dnerf.samplers.occupancy_grid import OccupancyGrid
-from dnerf.samplers.visibility import by_chance, joined, visible_weights
+from dnerf.samplers.visibility import by_chance, visible_weights
 
 # Few rays of a training batch have more samples in occupied cells: a second round costs more than it saves.
 FIRST_ROUND = 64
@@ -49,8 +49,6 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
         chance_weight: weight in the image, in [0, 1), below which that filter takes samples by chance, in proportion to
             it, and makes them count for as much more: of much that is thin a few samples learn, and more rays are seen
             for the same number. 0 takes all; so do fields whose density needs an interval's ends (`IntervalAware`).
-        filter_joins: until intervals are cut, the filter of `min_weight` evaluates once for so many neighbouring ones,
-            and keeps all or none.
         pad_to: in training, and where intervals are cut, the number of samples is rounded up to a multiple of this,
             see `Samples.padded` (1 for no padding).
 
@@ -61,18 +59,17 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
     def __init__(
         self, grid: OccupancyGrid, step_size: float | Schedule = 0.02, *, subdivision: int = 1,
         render_subdivision: int | None = None, subdivision_weight: float = 0.0, subdivide_from: float = 0.5,
-        narrow_from: float = 1.0, min_weight: float = 0.0, chance_weight: float = 0.0, filter_joins: int = 1,
-        pad_to: int = 2048,
+        narrow_from: float = 1.0, min_weight: float = 0.0, chance_weight: float = 0.0, pad_to: int = 2048,
     ) -> None:  # fmt: skip
         super().__init__()
         self.grid = grid
         self.step_schedule = step_size
         self.step_size = at(step_size, 1.0)
-        self.subdivision, self.filter_joins, self.pad_to = subdivision, filter_joins, pad_to
+        self.subdivision, self.pad_to = subdivision, pad_to
         self.render_subdivision = subdivision if render_subdivision is None else render_subdivision
         self.subdivision_weight, self.min_weight, self.chance_weight = subdivision_weight, min_weight, chance_weight
         self.subdivide_from, self.narrow_from = subdivide_from, narrow_from
-        for name in ("subdivision", "render_subdivision", "filter_joins", "pad_to"):
+        for name in ("subdivision", "render_subdivision", "pad_to"):
             check_whole(name, getattr(self, name))
         for name in ("subdivision_weight", "min_weight", "chance_weight"):
             check_within(name, getattr(self, name), "[0, 1)")
@@ -250,11 +247,10 @@ class OccupancySampler(Sampler, OccupancyAware, FrontToBack, FixedCapacity, Sche
     def _visible(
         self, samples: Samples, rays: Rays, field: RadianceField, generator: torch.Generator | None
     ) -> Samples:
-        joint, number = joined(samples, self.filter_joins if self.training_subdivision == 1 else 1)
         weights = visible_weights(
-            joint, rays, field, self.min_weight,
+            samples, rays, field, self.min_weight,
             first_round=FIRST_ROUND, most_at_once=MOST_AT_ONCE, pad_to=self.pad_to, observe=self.observe,
-        )[number]  # fmt: skip
+        )  # fmt: skip
         is_visible = ~(weights <= self.min_weight)  # NaN is
         is_visible, samples = self._by_chance(samples, weights, is_visible, field, generator)
         kept, count = samples.kept(is_visible), self.training_subdivision

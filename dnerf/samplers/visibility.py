@@ -116,37 +116,6 @@ def visible_weights(
 
 
 @torch.no_grad()
-def joined(samples: Samples, most: int) -> tuple[Samples, Tensor]:
-    """Make up to `most` neighbours on a ray that touch each other one sample.
-
-    Args:
-        samples: N packed samples without points of their own.
-        most: neighbours in one, >= 1.
-
-    Returns:
-        M <= N packed samples of the same rays, and the number (N,) of the one that each sample is part of.
-    """
-    if samples.ray_indices is None or samples.points is not None:
-        raise ValueError("samples must be packed, with their points in the middle")
-    count = samples.starts.numel()
-    if most == 1 or not count:
-        return samples, torch.arange(count, device=samples.starts.device)
-    places = torch.arange(count, device=samples.starts.device)
-    begins = torch.ones_like(places, dtype=torch.bool)
-    begins[1:] = (samples.ray_indices.diff() != 0) | (samples.starts[1:] != samples.ends[:-1])
-    run_begins = torch.where(begins, places, 0).cummax(0).values
-    leads = (places - run_begins) % most == 0
-    leaders = leads.nonzero()[:, 0]
-    lasts = torch.cat([leaders[1:] - 1, places[-1:]])
-    before = torch.nn.functional.pad(leads.cumsum(0), (1, 0))
-    merged = Samples(
-        samples.starts[leaders], samples.ends[lasts], samples.num_rays, ray_indices=samples.ray_indices[leaders],
-        ray_offsets=before[samples.offsets],
-    )  # fmt: skip
-    return merged, before[1:] - 1
-
-
-@torch.no_grad()
 def by_chance(chances: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Take samples (N,) with such chances in [0, 1]; of neighbours as many as their chances add up to: systematic
     sampling (Kitagawa, JCGS 1996)."""

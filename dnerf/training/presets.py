@@ -66,10 +66,10 @@ def make_renderer(
         OccupancyGrid(corners, 64, decay=0.6, render_dilation=0),
         Ramp(0.04, 0.028, end=0.5, kind="exponential"),
         subdivision=2, render_subdivision=3, subdivision_weight=0.02, narrow_from=0.3, min_weight=1e-4,
-        chance_weight=0.02, filter_joins=2,
+        chance_weight=0.02,
     )  # fmt: skip
     return Renderer(
-        DeformedField(CachedDeformation(deformation, corners), field), sampler,
+        DeformedField(CachedDeformation(deformation, corners, spacing=0.05), field), sampler,
         RandomBackground("white") if background is None else background, precision="bfloat16", stop_transmittance=4e-3,
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from dnerf.core.rays import Rays, Samples
 from dnerf.fields import RadianceField
 from dnerf.fields.base import IntervalAware
 from dnerf.samplers.base import Capacity
-from dnerf.samplers.visibility import by_chance, joined, visible_weights
+from dnerf.samplers.visibility import by_chance, visible_weights
 
 
 class CountingField(FormulaField):
@@ -215,56 +215,6 @@ def test_a_field_that_needs_the_ends_of_intervals_gets_all_of_them() -> None:
         for w in (0.0, 0.02)
     )
     assert torch.equal(plain.starts, lucky.starts)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.lists(st.integers(0, 3), max_size=20), min_size=1, max_size=5), st.integers(1, 4))
-def test_joined_intervals_are_those_of_a_loop(gaps: list[list[int]], most: int) -> None:
-    """Intervals of length one, each so far behind the one before on its ray; those without a gap touch."""
-    counts = [len(g) for g in gaps]
-    starts = [sum(g[: i + 1]) + i for g in gaps for i in range(len(g))]
-    rays = [ray for ray, g in enumerate(gaps) for _ in g]
-    first = torch.tensor(starts, dtype=torch.float64)
-    samples = Samples(first, first + 1, len(gaps), ray_indices=torch.tensor(rays, dtype=torch.int64))
-    expected: list[list[float]] = []  # ray, start, end, members
-    numbers = []
-    for ray, start in zip(rays, starts, strict=True):
-        last = expected[-1] if expected else None
-        if last is not None and last[0] == ray and last[2] == start and last[3] < most:
-            last[2], last[3] = start + 1, last[3] + 1
-        else:
-            expected.append([ray, start, start + 1, 1])
-        numbers.append(len(expected) - 1)
-    merged, number = joined(samples, most)
-    assert number.tolist() == numbers
-    assert merged.ray_indices is not None
-    assert [
-        [float(r), a, b]
-        for r, a, b in zip(merged.ray_indices.tolist(), merged.starts.tolist(), merged.ends.tolist(), strict=True)
-    ] == [e[:3] for e in expected]
-    assert merged.offsets.diff().tolist() == [sum(e[0] == ray for e in expected) for ray in range(len(counts))]
-
-
-def test_joining_wants_packed_samples() -> None:
-    dense = Samples(torch.zeros(2, 3), torch.ones(2, 3), 2)
-    with pytest.raises(ValueError, match="must be packed"):
-        joined(dense, 2)
-
-
-def test_a_filter_that_evaluates_pairs_keeps_what_counts_at_half_the_price() -> None:
-    rays, box = rays_towards_origin(200), [[-1.0] * 3, [1.0] * 3]
-    images, evaluated = [], []
-    for joins in (1, 2):
-        field, thin = ball(), ball(0.1)
-        sampler = occupancy_sampler(box, 0.02, min_weight=1e-4, filter_joins=joins, pad_to=1).train()
-        sampler(rays, thin, generator=torch.Generator().manual_seed(0))
-        evaluated.append(thin.num_points)
-        samples = sampler(rays, field, generator=torch.Generator().manual_seed(0))
-        images.append(composite(samples, field(*samples.locate(rays)), torch.ones(3)).rgb)
-    assert evaluated[1] < 0.52 * evaluated[0]  # an odd one out on each ray
-    # A pair is looked at in its middle: the surface's outermost interval can be missed where the middle is outside,
-    # after which the next three of density 200 and length 0.02 still leave no more than exp(-12) of the light.
-    assert (images[0] - images[1]).abs().mean() < 0.01
 
 
 def test_the_filter_evaluates_no_more_at_once_than_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:

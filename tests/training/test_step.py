@@ -134,7 +134,7 @@ def test_opacity_counts_in_errors_and_contrast_before_any_background() -> None:
 
 def test_fixed_places_teach_what_others_teach(frames: Frames) -> None:
     """The same gradients, where all that is wanted fits."""
-    free, fixed = small_renderer(filter_joins=1).train(), small_renderer().train()
+    free, fixed = small_renderer().train(), small_renderer().train()
     indices = pixels(frames, 100, 1, torch.device("cpu"))
     for progress in (0.0, 1.0):
         for renderer, capacity in ((free, None), (fixed, Capacity(40000, 20000))):
