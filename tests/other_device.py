@@ -130,9 +130,7 @@ def other_device() -> Iterator[torch.device]:
     if not hasattr(torch, NAME):
         backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=_Module())
     with (
-        _Dispatch(),
-        patch("torch.Generator", _Generator),
-        patch("torch.tensor", _then_moved(torch.tensor)),
+        _Dispatch(), patch("torch.Generator", _Generator), patch("torch.tensor", _then_moved(torch.tensor)),
         patch("torch.as_tensor", _then_moved(torch.as_tensor)),
-    ):
+    ):  # fmt: skip
         yield torch.device(f"{NAME}:0")

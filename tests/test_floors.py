@@ -9,14 +9,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
-    {"core", "nn", "kernels"},
-    {"deformations"},
-    {"fields"},
-    {"samplers"},
-    {"rendering", "scenes"},
-    {"data", "losses", "motion"},
-    {"training", "evaluation", "visualization", "planning", "capturing", "meshing"},
-)
+    {"core", "nn", "kernels"}, {"deformations"}, {"fields"}, {"samplers"}, {"rendering", "scenes"},
+    {"data", "losses", "motion"}, {"training", "evaluation", "visualization", "planning", "capturing", "meshing"},
+)  # fmt: skip
 OUTSIDE = {"benchmarks", "scripts", "tests"}  # know the package, which knows nothing of them
 LOOSE = {"__init__", "__main__", "_version"}  # modules of the package itself
 ONLY_SCRIPTS_KNOW = {"hydra", "omegaconf"}

@@ -29,15 +29,10 @@ POINTS, MANIFEST = "points.ply", "transforms.json"
 
 
 def capture(
-    out_dir: Path,
-    films: Sequence[Film],
+    out_dir: Path, films: Sequence[Film],
     settings: StructureSettings = StructureSettings(),  # noqa: B008 (it is frozen)
-    *,
-    model: Path | None = None,
-    num_frames: int = 120,
-    width: int = 960,
-    min_share: float = 0.5,
-) -> list[str]:
+    *, model: Path | None = None, num_frames: int = 120, width: int = 960, min_share: float = 0.5,
+) -> list[str]:  # fmt: skip
     """Make a data set, and say how good it is: lines of a report, warnings last.
 
     Each stage leaves its result in `out_dir`, and is not done again. `transforms.json` is written last.

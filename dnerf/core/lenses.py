@@ -183,9 +183,7 @@ def _opencv(k: Coefficients, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tens
     below_slope = k[3] + square * (2 * k[4] + square * (3 * k[5]))
     slope = 2 * (above_slope - scale * below_slope) / below
     return (
-        x * scale + 2 * p1 * xy + p2 * (square + 2 * xx),
-        y * scale + p1 * (square + 2 * yy) + 2 * p2 * xy,
-        scale + xx * slope + 2 * p1 * y + 6 * p2 * x,
-        xy * slope + 2 * p1 * x + 2 * p2 * y,
+        x * scale + 2 * p1 * xy + p2 * (square + 2 * xx), y * scale + p1 * (square + 2 * yy) + 2 * p2 * xy,
+        scale + xx * slope + 2 * p1 * y + 6 * p2 * x, xy * slope + 2 * p1 * x + 2 * p2 * y,
         scale + yy * slope + 6 * p1 * y + 2 * p2 * x,
-    )
+    )  # fmt: skip

@@ -188,14 +188,11 @@ class Samples:
         before = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
         whole, number = parts_of(counts)
         starts, ends, parts = self.starts[whole], self.ends[whole], counts[whole].to(self.starts.dtype)
-        return replace(
-            self,
-            starts=torch.lerp(starts, ends, number / parts),  # exact at both ends
-            ends=torch.lerp(starts, ends, (number + 1) / parts),
-            ray_indices=self.ray_indices[whole],
-            ray_offsets=before[self.offsets],
+        return replace(  # exact at both ends
+            self, starts=torch.lerp(starts, ends, number / parts), ends=torch.lerp(starts, ends, (number + 1) / parts),
+            ray_indices=self.ray_indices[whole], ray_offsets=before[self.offsets],
             bounds=tuple(bound[whole] for bound in self.bounds),
-        )
+        )  # fmt: skip
 
     def stretched(self, factors: Tensor) -> "Samples":
         """Intervals so many times as long, (N,) >= 1, around the same middles; they may overlap. For samples that stand

@@ -55,16 +55,12 @@ class CachedDeformation(WrappedDeformation, PerFrame):
         self.cells = cubes(corners, resolution)
 
     def forward(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Canonical positions (..., 3) of positions (..., 3) at times (...,).
-
-        They are exact if positions or times want gradients, and where knots are not used.
-        """
+        """Canonical positions (..., 3) of positions (..., 3) at times (...,); exact for those that want gradients."""
         is_exact = positions.requires_grad or times.requires_grad or positions.is_cuda or self.deformation.is_identity
         if is_exact or not (self.training and self.spacing and positions.ndim == 2 and len(positions)):
             return self.deformation(positions, times)
         check_positions_times(positions, times)
-        spacing = self.spacing if torch.is_grad_enabled() else 2 * self.spacing
-        return between_knots(self.deformation, positions, times, spacing)
+        return between_knots(self.deformation, positions, times, self.spacing * (1 if torch.is_grad_enabled() else 2))
 
     def at_time(self, time: float, extent: Tensor | None = None) -> Deformation:
         """The lattice at a time, for what lies in a box (2, 3); the deformation itself, if nothing moves."""

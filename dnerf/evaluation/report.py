@@ -72,20 +72,14 @@ def write_report_text(
     first, listed = metrics[0], [{"protocol": "own", **m} for m in metrics]
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        title=title,
-        lead=_lead(first),
-        cards=_cards(first),
-        protocol_note=_protocol_note(first),
+        title=title, lead=_lead(first), cards=_cards(first), protocol_note=_protocol_note(first),
         films=[_film(path) for path in films],
         sheets=[{"title": heading, "caption": caption, "uri": data_uri(path)} for heading, caption, path in sheets],
         curves=[_curve(m) for m in metrics if len(m["frames"]) > 1],
-        temporal=None if temporal is None else _temporal(temporal),
-        plan=plan,
+        temporal=None if temporal is None else _temporal(temporal), plan=plan,
         # A row per measure and a column per evaluation: there are many of the one and few of the other.
         table=[(name, [cell(m.get(key), form) for m in listed]) for key, name, form in filled_columns(listed)],
-        facts=_facts(first),
-        frames=_frames(first["frames"]),
-        config=config,
+        facts=_facts(first), frames=_frames(first["frames"]), config=config,
     )  # fmt: skip
 
 

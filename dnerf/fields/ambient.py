@@ -5,7 +5,7 @@ from torch import Tensor
 
 from dnerf.core.checks import check_whole
 from dnerf.deformations.base import check_positions_times
-from dnerf.fields.space_time import SpaceTimeFeatures
+from dnerf.fields.head import SpaceTimeFeatures
 from dnerf.nn.encodings import SinusoidalEncoding, TimeEncoding
 from dnerf.nn.mlp import MLP
 from dnerf.nn.parameter_groups import DeclaresGroups, ParameterGroup, network_groups

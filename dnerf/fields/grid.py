@@ -11,8 +11,7 @@ from dnerf.core.geometry import cubes, in_unit_cube
 from dnerf.core.spherical_harmonics import spherical_harmonics
 from dnerf.deformations.base import check_one_time, check_positions_times
 from dnerf.fields.base import NetworkTabled, NetworkTables, RadianceField, warn_of_generic_path
-from dnerf.fields.head import HeadedField
-from dnerf.fields.space_time import SpaceTimeFeatures
+from dnerf.fields.head import HeadedField, SpaceTimeFeatures
 from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, series_sums, shade
 from dnerf.nn.parameter_groups import ParameterGroup
 

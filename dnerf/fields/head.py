@@ -1,7 +1,7 @@
 """A tiny head on features of places and times: density and colour."""
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,6 @@ from dnerf.core.spherical_harmonics import DEGREES, spherical_harmonics
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.activations import activate_density
 from dnerf.fields.base import RadianceField, TimeDependence
-from dnerf.fields.space_time import SpaceTimeFeatures
 from dnerf.kernels import series_sums
 from dnerf.nn.mlp import MLP
 from dnerf.nn.parameter_groups import DeclaresGroups, HasOutputLabels, ParameterGroup
@@ -21,6 +20,16 @@ from dnerf.nn.parameter_groups import DeclaresGroups, HasOutputLabels, Parameter
 # Of harmonics beside the constant, which stays one: this makes them orthonormal. All coefficients take steps of one
 # size, and a colour's dependence on direction is best found more slowly than the colour.
 VIEW_SCALE = 1 / math.sqrt(4 * math.pi)
+
+
+class SpaceTimeFeatures(nn.Module, ABC):
+    """Features of places at times, for a head to see beside a field's own."""
+
+    out_features: int
+
+    @abstractmethod
+    def forward(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Features (..., n) at positions (..., 3) and times (...,) in [0, 1]."""
 
 
 class HeadedField(RadianceField, TimeDependence, DeclaresGroups, HasOutputLabels, Scheduled):

@@ -31,17 +31,21 @@ def normals(field: RadianceField, positions: Tensor, times: Tensor) -> Tensor:
     return torch.zeros_like(positions) if gradient is None else safe_normalize(gradient)
 
 
-def differences(surface: SignedDistance, positions: Tensor, times: Tensor, step: Tensor | float) -> Tensor:
+def differences(
+    surface: SignedDistance, positions: Tensor, times: Tensor, step: Tensor | float
+) -> tuple[Tensor, Tensor]:
     """Gradients (N, 3) of a distance at positions (N, 3) from central differences, which can be trained by.
 
-    The step is in world units. Unlike `normals` they serve deformations of one frame kept on a lattice, too.
+    And how much its slopes along the axes change over the step, the squares' sum (N,): at most 2 (step / R)^2 at
+    the surface of a ball of radius R. The step is in world units. Unlike `normals` they serve deformations of one frame
+    kept on a lattice, too.
     """
     steps = step * torch.eye(3, dtype=positions.dtype, device=positions.device)
     # Networks in half precision round by as much as the differences are.
     with torch.autocast(positions.device.type, enabled=False):
-        places = positions + torch.stack([steps, -steps])[:, :, None]
-        up, down = surface.distance(places, times.expand(2, 3, -1))
-    return ((up - down) / (2 * step)).mT
+        places = positions + torch.cat([steps, -steps, 0 * steps[:1]])[:, None]
+        up, down, here = surface.distance(places, times.expand(7, -1)).split([3, 3, 1])
+    return ((up - down) / (2 * step)).mT, ((up + down - 2 * here) / step).square().sum(0)
 
 
 class NormalField(RadianceField, IntervalAware, SignedDistance):

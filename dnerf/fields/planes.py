@@ -9,8 +9,7 @@ from dnerf.core.checks import as_box, check_choice, check_positive, check_whole
 from dnerf.core.geometry import cubes, in_unit_cube
 from dnerf.deformations.base import check_positions_times
 from dnerf.fields.base import HasRoughness, training_gib
-from dnerf.fields.head import HeadedField
-from dnerf.fields.space_time import SpaceTimeFeatures
+from dnerf.fields.head import HeadedField, SpaceTimeFeatures
 from dnerf.kernels import GridLevels, grid_encode
 
 AXES = ((0, 1), (0, 2), (1, 2), (2, 3), (1, 3), (0, 3))

@@ -77,11 +77,8 @@ def seen_parts_reference(
     whole, number = parts_of(counts)
     before = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     first, last, parts = starts[whole], ends[whole], counts[whole]
-    return SeenParts(
-        starts=torch.lerp(first, last, number / parts.to(first.dtype)),  # exact at both ends
-        ends=torch.lerp(first, last, (number + 1) / parts.to(first.dtype)),
-        ray_indices=rays[whole],
-        offsets=before[offsets],
-        whole=whole,
-        new=(2 * number + 1 != parts).nonzero()[:, 0],
-    )
+    return SeenParts(  # parts' ends are exact at both ends of the whole
+        starts=torch.lerp(first, last, number / parts.to(first.dtype)),
+        ends=torch.lerp(first, last, (number + 1) / parts.to(first.dtype)), ray_indices=rays[whole],
+        offsets=before[offsets], whole=whole, new=(2 * number + 1 != parts).nonzero()[:, 0],
+    )  # fmt: skip

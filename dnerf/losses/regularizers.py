@@ -235,25 +235,30 @@ class EikonalLoss(PlacesLoss):
     """The gradient of a signed distance has length one: the mean of `(|grad d| - 1)^2`, in canonical space.
 
     At some of a batch's own samples, and at as many places spread over a box. The gradient is that of central
-    differences over a cell of the finest open level of the grid: they reach into neighbouring cells, so that surfaces
-    become smooth, and need no second derivatives.
+    differences over a cell of the finest open level of the grid: they reach into neighbouring cells, and need no second
+    derivatives. At the samples surfaces should hardly bend within a cell, either: features that are linear in each cell
+    leave them rough by some degrees, which images hardly tell.
 
-    Source: IGR (arXiv 2002.10099) eq. 2; differences that follow the levels from Neuralangelo (arXiv 2306.03092)
-    section 3.2.
+    Source: IGR (arXiv 2002.10099) eq. 2; differences that follow the levels, and a price on second ones, from
+    Neuralangelo (arXiv 2306.03092) sections 3.2 and 3.3. Deviation: theirs are not squared, and per unit of length.
 
     Args:
         box: (2, 3) corners of the space in which places lie, in world units.
         weight, every: see `Loss`.
         num_points: samples of each batch, and as many places in the box.
+        bending: price of bends beside that of lengths: of the squared change of slopes over a cell.
 
     Raises:
-        ValueError: for a box that is none, a negative weight, or no points.
+        ValueError: for a box that is none, a negative weight or price, or no points.
     """
 
     def __init__(
-        self, box: Sequence[Sequence[float]], weight: float | Schedule = 3e-3, num_points: int = 256, *, every: int = 1
-    ) -> None:
+        self, box: Sequence[Sequence[float]], weight: float | Schedule = 3e-3, num_points: int = 256, *,
+        bending: float = 1.0, every: int = 1,
+    ) -> None:  # fmt: skip
         super().__init__(weight, num_points, dimensions=3, every=every)
+        check_positive("bending", bending, allow_zero=True)
+        self.bending = bending
         self.box = nn.Buffer(as_box(box), persistent=False)
 
     def check(self, model: Renderer) -> None:
@@ -262,7 +267,7 @@ class EikonalLoss(PlacesLoss):
             raise ValueError(f"EikonalLoss needs a field with a signed distance, got {type(model.field).__name__}")
 
     def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
-        """Mean squared deviation from one; other places at every call."""
+        """Mean squared deviation from one, and price of bends; other places at every call."""
         surface = canonical_surface(model.field)
         assert surface is not None
         assert rendering.output is not None
@@ -274,5 +279,7 @@ class EikonalLoss(PlacesLoss):
             chosen = spread_numbers(extras["times"].shape, self.num_points, unit.device)
             places.append(extras["canonical_positions"].detach().reshape(-1, 3)[chosen])
             times.append(extras["times"].reshape(-1)[chosen])
-        gradients = differences(surface, torch.cat(places), torch.cat(times), surface.detail)
-        return (gradients.norm(dim=-1) - 1).square().mean()
+        gradients, bends = differences(surface, torch.cat(places), torch.cat(times), surface.detail)
+        lengths = (gradients.norm(dim=-1) - 1).square().mean()
+        own = bends[self.num_points :]
+        return lengths + self.bending * own.mean() if own.numel() else lengths

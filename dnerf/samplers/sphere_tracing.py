@@ -127,7 +127,7 @@ class SphereTracingSampler(Sampler):
         low, high = self.box.to(unit.dtype)
         places = torch.lerp(low, high, unit[:, :3])
         times = rays.times[(unit[:, 3] * len(rays)).long().clamp(max=len(rays) - 1)]
-        steepest = _numbers(differences(surface, places, times, PROBE_STEP)).norm(dim=-1).max()
+        steepest = _numbers(differences(surface, places, times, PROBE_STEP)[0]).norm(dim=-1).max()
         return surface.distance(places, times), (self.safety * steepest).clamp(min=1)
 
 

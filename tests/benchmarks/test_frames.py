@@ -17,12 +17,8 @@ from dnerf.scenes import SCENES
 
 BOX = [[-1.5] * 3, [1.5] * 3]
 OPTIONS = {
-    "split": "test",
-    "num_frames": 2,
-    "scales": [1],
-    "repeats": 1,
-    "ways": {"whole intervals": ["subdivision=1"]},
-}
+    "split": "test", "num_frames": 2, "scales": [1], "repeats": 1, "ways": {"whole intervals": ["subdivision=1"]},
+}  # fmt: skip
 
 
 def renderer(subdivision: int) -> Renderer:

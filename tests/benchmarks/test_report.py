@@ -20,12 +20,8 @@ def result(**changes):
         "errors", "Errors", "samples", "error", [Series("left", [8, 16], [0.1, 0.05], [0.09, 0.04], [0.2, 0.1])]
     )
     values = {
-        "title": "T",
-        "summary": "S",
-        "tables": [Table("Two rows!", rows, "N")],
-        "plots": [plot],
-        "findings": ["F"],
-    }
+        "title": "T", "summary": "S", "tables": [Table("Two rows!", rows, "N")], "plots": [plot], "findings": ["F"],
+    }  # fmt: skip
     return SuiteResult(**{**values, **changes})
 
 

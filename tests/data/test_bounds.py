@@ -12,7 +12,7 @@ from dnerf.core.cameras import Intrinsics, look_at
 from dnerf.core.geometry import ray_box
 from dnerf.data import Frames, SyntheticData, random_views, render_frames
 from dnerf.data.bounds import check_views, cut_faces, fit_box, seen_box, share_of_views
-from dnerf.data.carving import MAX_SUPPORT, Silhouettes, hold_opaque
+from dnerf.data.carving import hold_opaque
 from dnerf.samplers import OccupiedCells
 from dnerf.scenes import SCENES, make_scene
 
@@ -86,36 +86,6 @@ def test_no_opaque_pixel_looks_past_the_fitted_box(index: int, row: int, column:
     for box in (fit_box(frames), hold_opaque(frames, torch.tensor([[-0.1] * 3, [0.1] * 3]))):
         enter, leave = ray_box(rays.origins, rays.directions, box)
         assert (enter.maximum(rays.near) <= leave.minimum(rays.far) + 1e-4).all()
-
-
-def test_support_is_the_number_of_consecutive_views_that_are_opaque_there() -> None:
-    frames = SyntheticData(make_scene("orbiting_balls"), 24, num_train=10).frames("train")
-    order = torch.randperm(10).tolist()
-    silhouettes = Silhouettes.of(frames.subset(order))
-    index, rays = silhouettes.outlines()
-    distances = torch.lerp(rays.near[:, None], rays.far[:, None], torch.rand(len(rays), 5))
-    motion = 0.05
-    found = silhouettes.support(index, rays, distances, motion)
-
-    def is_opaque(view: int, own: int, position: torch.Tensor) -> bool:
-        pixel, depth = frames.camera(view).project(position)
-        column, row = (pixel + 0.5).floor().int().tolist()
-        if not (2 <= depth <= 6 and 0 <= column < 24 and 0 <= row < 24):
-            return False
-        reach = int(1 + motion * 24 * abs(view - own))
-        window = frames.images[view, max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
-        return bool((window[..., 3] >= 26).any())
-
-    for ray in range(0, len(rays), 7):
-        for step in range(5):
-            own = int(index[ray])
-            position = rays.origins[ray] + distances[ray, step] * rays.directions[ray]
-            expected = 1
-            for side in (-1, 1):
-                view = own + side
-                while 0 <= view < 10 and is_opaque(view, own, position):
-                    expected, view = expected + 1, view + side
-            assert int(found[ray, step]) == min(expected, MAX_SUPPORT)
 
 
 def test_images_that_show_nothing_give_what_cameras_see_those_that_show_something_everywhere_what_a_tenth_see() -> None:

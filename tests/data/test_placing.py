@@ -62,10 +62,8 @@ def move(root: Path, scale: float, turn: torch.Tensor = IDENTITY, shift: tuple[f
 
 
 @pytest.mark.parametrize(("scale", "turn", "shift"), [
-    (1e-3, IDENTITY, (0.0, 0.0, 0.0)),
-    (0.4, IDENTITY, (12.0, -7.0, 3.0)),
-    (50.0, Y_UP, (0.0, 0.0, 0.0)),
-    (1e3, Y_UP, (4e5, -5e6, 120.0)),
+    (1e-3, IDENTITY, (0.0, 0.0, 0.0)), (0.4, IDENTITY, (12.0, -7.0, 3.0)),
+    (50.0, Y_UP, (0.0, 0.0, 0.0)), (1e3, Y_UP, (4e5, -5e6, 120.0)),
     (2.0, TILTED, (1.0, 2.0, 3.0)),
 ])  # fmt: skip
 def test_units_origin_and_up_do_not_change_what_is_learnt(

@@ -32,10 +32,8 @@ def test_context_manager_restores_the_backend_after_an_error():
 
 
 @pytest.mark.parametrize(("tensor", "expected"), [
-    (torch.zeros(1), "numba"),
-    (torch.zeros(1, dtype=torch.float64), "numba"),
-    (torch.zeros(1, dtype=torch.bfloat16), "reference"),
-    (torch.zeros(1, device="meta"), "reference"),
+    (torch.zeros(1), "numba"), (torch.zeros(1, dtype=torch.float64), "numba"),
+    (torch.zeros(1, dtype=torch.bfloat16), "reference"), (torch.zeros(1, device="meta"), "reference"),
 ])  # fmt: skip
 def test_auto_chooses_by_device_and_dtype(tensor, expected):
     assert under("auto", backend.choose, tensor) == expected

@@ -34,10 +34,8 @@ def test_small_arguments_keep_their_digits():
 
 
 @pytest.mark.parametrize(("x", "expected"), [
-    (0.0, (1, 0, 0.5)),
-    (-0.0, (1, 0, 0.5)),
-    (-1e30, (math.exp(-87), -1, math.exp(-88))),
-    (-math.inf, (math.exp(-87), -1, math.exp(-88))),
+    (0.0, (1, 0, 0.5)), (-0.0, (1, 0, 0.5)),
+    (-1e30, (math.exp(-87), -1, math.exp(-88))), (-math.inf, (math.exp(-87), -1, math.exp(-88))),
     (math.inf, (math.exp(88), math.exp(88), 1)),
 ])  # fmt: skip
 def test_ends_of_the_range(x, expected):

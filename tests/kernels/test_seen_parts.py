@@ -32,13 +32,10 @@ def weights_of(arguments: tuple[Tensor, ...]) -> Tensor:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    counts=st.lists(st.integers(0, 40), max_size=8),
-    subdivision=st.integers(1, 4),
-    subdivision_weight=st.sampled_from([0.0, 0.02, 0.3]),
-    least=st.sampled_from([1e-12, 4e-3]),
-    is_double=st.booleans(),
-    seed=st.integers(0, 9),
-)
+    counts=st.lists(st.integers(0, 40), max_size=8), subdivision=st.integers(1, 4),
+    subdivision_weight=st.sampled_from([0.0, 0.02, 0.3]), least=st.sampled_from([1e-12, 4e-3]),
+    is_double=st.booleans(), seed=st.integers(0, 9),
+)  # fmt: skip
 def test_numba_equals_the_definition(
     counts: list[int], subdivision: int, subdivision_weight: float, least: float, is_double: bool, seed: int
 ) -> None:

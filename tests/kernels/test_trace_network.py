@@ -85,15 +85,11 @@ def assert_same(found: tuple[Tensor, Tensor], expected: tuple[Tensor, Tensor], c
 
 @settings(max_examples=25, deadline=None)
 @given(
-    count=st.sampled_from([0, 1, 5, 64, 65, 300, 700]),
-    known=st.sampled_from([1.0, 0.9]),
-    density=st.sampled_from([-3.0, 2.0, 6.0]),
-    subdivision=st.sampled_from([1, 2, 3, 4]),
-    stop=st.sampled_from([0.0, 1e-3, 0.1]),
-    share=st.sampled_from([0.0, 0.3, 1.0]),
-    degree=st.sampled_from([0, 0, 1, 2, 3, 4]),
-    seed=st.integers(0, 99),
-)
+    count=st.sampled_from([0, 1, 5, 64, 65, 300, 700]), known=st.sampled_from([1.0, 0.9]),
+    density=st.sampled_from([-3.0, 2.0, 6.0]), subdivision=st.sampled_from([1, 2, 3, 4]),
+    stop=st.sampled_from([0.0, 1e-3, 0.1]), share=st.sampled_from([0.0, 0.3, 1.0]),
+    degree=st.sampled_from([0, 0, 1, 2, 3, 4]), seed=st.integers(0, 99),
+)  # fmt: skip
 def test_kernel_equals_definition(count, known, density, subdivision, stop, share, degree, seed) -> None:
     tables = scene(seed, known=known, density=density, share=share, degree=degree)
     options = OPTIONS | {"subdivision": subdivision, "stop_transmittance": stop}

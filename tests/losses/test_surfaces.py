@@ -1,4 +1,4 @@
-"""The eikonal term: zero for true distances, and what it costs where they are not."""
+"""The eikonal term: zero for true distances, what it costs where they are not, and what bends cost."""
 
 import pytest
 import torch
@@ -39,11 +39,11 @@ def slope(factor: float) -> Slope:
     return field
 
 
-def term(field: RadianceField) -> Tensor:
+def term(field: RadianceField, bending: float = 0.0) -> Tensor:
     z = torch.tensor([-0.1, 0.2])
     rays = Rays(torch.tensor([[0.0, 0, 2], [0.1, 0, 2]]), torch.tensor([[0.0, 0, -1]] * 2), z.abs(), 0 * z, 4 + 0 * z)
     model = Renderer(field, StratifiedSampler(16))
-    loss = EikonalLoss(BOX)
+    loss = EikonalLoss(BOX, bending=bending)
     loss.check(model)
     return loss(model(rays), NOTHING, model)
 
@@ -55,6 +55,35 @@ def test_the_term_is_the_squared_deviation_of_the_slope_from_one(factor: float) 
     assert float(value.detach()) == pytest.approx((factor - 1) ** 2, abs=1e-5)
     value.backward()
     assert field.table.grad.isfinite().all()
+
+
+class Ball(Slope):
+    """Of radius 0.5 about the origin."""
+
+    def _distance(self, positions: Tensor, raw: Tensor) -> Tensor:
+        return positions.norm(dim=-1) - 0.5 + 0 * raw
+
+
+def test_bends_of_a_ball_are_those_of_its_second_derivatives() -> None:
+    """Along axis i the second derivative of |x| is (1 - n_i^2) / |x|."""
+    x = 0.5 * torch.nn.functional.normalize(torch.randn(40, 3, dtype=torch.float64), dim=-1)
+    _, found = differences(Ball(BOX, (4,), 2, max_rows=1024).double(), x, x[:, 0], 0.01)
+    expected = ((1 - (x / 0.5) ** 2) / 0.5).square().sum(-1) * 0.01**2
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+    assert (found <= 2 * (0.01 / 0.5) ** 2 * 1.001).all()
+
+
+def test_bends_are_priced_at_the_samples_alone() -> None:
+    """All rays are near a fold of the distance, which few places of the box are."""
+
+    class Fold(Slope):
+        def _distance(self, positions: Tensor, raw: Tensor) -> Tensor:
+            return positions[..., 1].abs() + 0 * raw
+
+    field = DeformedField(IdentityDeformation(), Fold(BOX, (4,), 2, max_rows=1024))
+    free, dear = (float(term(field, bending).detach()) for bending in (0.0, 3.0))
+    # At a distance y of the fold slopes change by 2 (1 - |y| / h) over a step h; samples lie at y = 0.
+    assert dear - free == pytest.approx(3.0 * 4, rel=1e-3)
 
 
 def test_it_holds_in_canonical_space() -> None:
@@ -70,7 +99,7 @@ def test_differences_are_the_gradient_up_to_second_order() -> None:
     x = (0.1 + 0.3 * torch.rand(50, 3, dtype=torch.float64)).requires_grad_()  # within one cell
     (exact,) = torch.autograd.grad(field.distance(x, x[:, 0]).sum(), x)
     # A ReLU bends in places: most are smooth.
-    errors = [(differences(field, x, x[:, 0], h) - exact).norm(dim=-1).detach().quantile(0.7) for h in (2e-3, 1e-3)]
+    errors = [(differences(field, x, x[:, 0], h)[0] - exact).norm(dim=-1).detach().quantile(0.7) for h in (2e-3, 1e-3)]
     assert errors[0] < 1e-4
     assert errors[1] < 0.3 * errors[0]
 

@@ -18,11 +18,9 @@ pytest.importorskip("skimage")
 extract = partial(extract_surface, time=0.0, box=BOX)
 LENGTH = math.sqrt(0.3**2 + 0.2**2 + 0.4**2)  # of the capsule's segment
 VOLUMES = {
-    ball: 4 / 3 * math.pi * 0.5**3,
-    box: 8 * 0.5 * 0.4 * 0.3,
-    capsule: math.pi * 0.3**2 * (LENGTH + 4 / 3 * 0.3),
-    torus: 2 * math.pi**2 * 0.5 * 0.2**2,
-}
+    ball: 4 / 3 * math.pi * 0.5**3, box: 8 * 0.5 * 0.4 * 0.3,
+    capsule: math.pi * 0.3**2 * (LENGTH + 4 / 3 * 0.3), torus: 2 * math.pi**2 * 0.5 * 0.2**2,
+}  # fmt: skip
 SHAPES = pytest.mark.parametrize("shape", VOLUMES, ids=lambda shape: shape.__name__)
 
 

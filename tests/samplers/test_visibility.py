@@ -67,13 +67,9 @@ def table_field(samples: Samples, values: Tensor) -> RadianceField:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.integers(0, 40), min_size=1, max_size=6).filter(any),
-    st.integers(0, 2**31),
-    st.sampled_from([1e-6, 1e-4, 1e-2]),
-    st.integers(1, 9),
-    st.sampled_from([1, 16]),
-    st.sampled_from([1, 7, 1 << 20]),
-)
+    st.lists(st.integers(0, 40), min_size=1, max_size=6).filter(any), st.integers(0, 2**31),
+    st.sampled_from([1e-6, 1e-4, 1e-2]), st.integers(1, 9), st.sampled_from([1, 16]), st.sampled_from([1, 7, 1 << 20]),
+)  # fmt: skip
 def test_weights_are_those_of_a_loop(
     counts: list[int], seed: int, min_weight: float, first_round: int, pad_to: int, most_at_once: int
 ) -> None:

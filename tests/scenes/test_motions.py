@@ -14,15 +14,11 @@ SLIDING = Slide(Wave(), parent=Orbit(0.5, 2.0, 0.1, 0.3))
 UPPER = Joint((0.1, 0.2, 0.3), (0.0, 1.0, 0.0), Wave(0.1, ((0.7, 1.0, 0.2),)), parent=SLIDING)
 CHAIN = Joint((0.0, 0.0, -0.4), (1.0, 0.0, 0.0), Wave(0.2, ((0.4, 2.0, 0.0), (0.1, 3.0, 0.5))), parent=UPPER)
 MOTIONS: list[Motion] = [
-    Fixed((0.1, 0.2, 0.3)),
-    Joint((0.1, 0.2, 0.3), (0.3, -0.2, 0.5), Wave(0.6)),
-    Orbit(0.7, -1.0, 0.3, 0.4, parent=Fixed((0.1, 0.0, -0.1))),
-    Spin(2.0, parent=Fixed((0.5, 0.0, 0.0))),
-    Slide(Wave(0.1, ((0.2, 1.0, 0.0),))),
-    Slide(Bounce(0.4, 3.0, 0.8)),
-    Pulse(Wave(1.0, ((0.3, 1.0, 0.25),)), parent=Fixed((0.0, 0.3, 0.0))),
-    CHAIN,
-]
+    Fixed((0.1, 0.2, 0.3)), Joint((0.1, 0.2, 0.3), (0.3, -0.2, 0.5), Wave(0.6)),
+    Orbit(0.7, -1.0, 0.3, 0.4, parent=Fixed((0.1, 0.0, -0.1))), Spin(2.0, parent=Fixed((0.5, 0.0, 0.0))),
+    Slide(Wave(0.1, ((0.2, 1.0, 0.0),))), Slide(Bounce(0.4, 3.0, 0.8)),
+    Pulse(Wave(1.0, ((0.3, 1.0, 0.25),)), parent=Fixed((0.0, 0.3, 0.0))), CHAIN,
+]  # fmt: skip
 
 every_motion = pytest.mark.parametrize("motion", MOTIONS, ids=lambda m: type(m).__name__)
 

@@ -47,13 +47,8 @@ def test_the_home_folder_is_found_and_what_is_no_path_is_left_alone(monkeypatch:
     value = understood(quoted_path("data.root=~/scenes"))
     assert getattr(value, "text", value) == "/home/some one/scenes"
     for word in (
-        "seed=0,1",
-        "data.box=[[0,0,0],[1,1,1]]",
-        "out_dir=null",
-        "data.root='as it is'",
-        "--multirun",
-        "~a.b",
-    ):
+        "seed=0,1", "data.box=[[0,0,0],[1,1,1]]", "out_dir=null", "data.root='as it is'", "--multirun", "~a.b",
+    ):  # fmt: skip
         assert quoted_path(word) == word
     assert quoted_path("data.root=a,b", is_sweep=True) == "data.root=a,b"
     assert quoted_path("data.root=${oc.env:DNERF_DATA}/x") == "data.root=${oc.env:DNERF_DATA}/x"
@@ -70,13 +65,7 @@ def test_check_data_says_and_draws_what_is_understood(
     importlib.import_module("check_data").main(config)
     said = capsys.readouterr().out
     for line in (
-        "format: blender",
-        "train: 6 frames of 16 x 16",
-        "test: 2 frames",
-        "lens: ",
-        "box: [[",
-        "planes: ",
-        "up: ",
-    ):
+        "format: blender", "train: 6 frames of 16 x 16", "test: 2 frames", "lens: ", "box: [[", "planes: ", "up: ",
+    ):  # fmt: skip
         assert line in said
     assert iio.imread(tmp_path / "check_data.png").shape == (960, 1440, 3)

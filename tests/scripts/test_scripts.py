@@ -9,15 +9,9 @@ from launcher import run_script
 from dnerf.planning.plan import load_plan
 
 TINY = (
-    "data.resolution=24",
-    "data.num_train=4",
-    "data.num_val=1",
-    "data.num_test=2",
-    "trainer.num_steps=3",
-    "trainer.num_rays=32",
-    "~trainer.callbacks.progress_bar",
-    "sampler.grid.resolution=16",
-)
+    "data.resolution=24", "data.num_train=4", "data.num_val=1", "data.num_test=2", "trainer.num_steps=3",
+    "trainer.num_rays=32", "~trainer.callbacks.progress_bar", "sampler.grid.resolution=16",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -86,15 +86,9 @@ def test_a_killed_rendering_goes_on_and_gives_the_same_bytes(work, capsys):
 def test_key_frames_make_a_film_at_their_own_pace(work):
     (work / "keys.json").write_text(json.dumps(KEYS))
     call(
-        "render",
-        "run=run",
-        "path=keyframes",
-        "path.file=keys.json",
-        "fps=10",
-        "resolution=[32,20]",
-        "format=[mp4,npz]",
-        "output=keys/film",
-    )
+        "render", "run=run", "path=keyframes", "path.file=keys.json", "fps=10", "resolution=[32,20]",
+        "format=[mp4,npz]", "output=keys/film",
+    )  # fmt: skip
     assert iio.imread(work / "keys" / "film.mp4").shape == (6, 20, 32, 3)
     with np.load(work / "keys" / "film.npz") as arrays:
         assert arrays["times"][[0, -1]] == pytest.approx([0.1, 0.6])
@@ -111,16 +105,9 @@ def test_a_camera_that_key_frames_misplace_is_named_with_its_file(work):
 
 def test_outputs_of_a_film_within_a_range_of_times(work):
     call(
-        "render",
-        "run=run",
-        "path=fixed",
-        "time=sweep",
-        "time_range=[0.2,0.8]",
-        "num_frames=5",
-        "format=npz",
-        "outputs=[deformation,motion]",
-        "output=part/film.npz",
-    )
+        "render", "run=run", "path=fixed", "time=sweep", "time_range=[0.2,0.8]", "num_frames=5", "format=npz",
+        "outputs=[deformation,motion]", "output=part/film.npz",
+    )  # fmt: skip
     with np.load(work / "part" / "film.npz") as arrays:
         assert arrays["times"] == pytest.approx([0.2, 0.35, 0.5, 0.65, 0.8])
         assert arrays["motion"].shape == (5, 24, 24, 2)
@@ -213,16 +200,9 @@ def test_truth_stands_beside_the_prediction(work):
 
 def test_evaluation_by_protocol_says_everything_and_makes_tables(work):
     call(
-        "evaluate",
-        "runs=[run,run]",
-        "lego_split=val",
-        "table=tables/t",
-        "worst=1",
-        "label=tiny",
-        "temporal.enabled=true",
-        "temporal.num_frames=3",
-        "temporal.resolution=16",
-    )
+        "evaluate", "runs=[run,run]", "lego_split=val", "table=tables/t", "worst=1", "label=tiny",
+        "temporal.enabled=true", "temporal.num_frames=3", "temporal.resolution=16",
+    )  # fmt: skip
     metrics = json.loads((work / "run" / "metrics.json").read_text())
     assert metrics.keys() >= {
         "protocol", "seed", "train_seconds", "hardware", "commit", "train_hardware", "train_commit", "resolution",

@@ -81,13 +81,11 @@ def trainer(stop: int = -1, spoilt: int = -1, **changes: Any) -> Trainer:
         pixels=ErrorGuidedPixels(TemporalCurriculum(0.5, 0.3), share=0.5, resolution=4),
         losses={"rgb": PhotometricLoss(), "unseen": UnseenSpaceLoss(BOX, every=2, memory_samples=100)},
         callbacks={
-            "checkpoints": Checkpoints(4),
-            "recovery": Recovery(),
-            "counts": Counts(stop, spoilt),
+            "checkpoints": Checkpoints(4), "recovery": Recovery(), "counts": Counts(stop, spoilt),
             "average": WeightAverage(every=3),
         },
         **({"log_every": 1} | changes),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("stop", "spoilt"), [(4, -1), (7, 3), (9, -1)])

@@ -289,14 +289,11 @@ def test_contact_sheet_holds_every_image_once_in_order(rows: tuple[str, ...], he
 @pytest.mark.parametrize(
     ("images", "columns", "rows"),
     [
-        ([], ["a"], []),
-        ([[]], [], []),
-        ([[torch.zeros(4, 4, 3)]], ["a", "b"], []),
-        ([[torch.zeros(4, 4, 3)]], ["a"], ["x", "y"]),
+        ([], ["a"], []), ([[]], [], []), ([[torch.zeros(4, 4)]], ["a"], []),
+        ([[torch.zeros(4, 4, 3)]], ["a", "b"], []), ([[torch.zeros(4, 4, 3)]], ["a"], ["x", "y"]),
         ([[torch.zeros(4, 4, 3), torch.zeros(4, 5, 3)]], ["a", "b"], []),
-        ([[torch.zeros(4, 4)]], ["a"], []),
     ],
-)
+)  # fmt: skip
 def test_contact_sheet_refuses_what_does_not_fit(images: list, columns: list, rows: list) -> None:
     with pytest.raises(ValueError, match=r"images|rows"):
         contact_sheet(images, columns, rows)

@@ -80,13 +80,11 @@ def _trace(
         values, part_values = scratch[5][worker], scratch[6][worker]
         moved, cells = scratch[7][worker], scratch[8][worker]
         asked = (
-            (origins, directions, numbers, owners, distances),
-            (displacements, level, low, sides, columns, moved),
-            (*field, basis),
-            (network, (lanes, group, vectors, last_group, last_vectors)),
+            (origins, directions, numbers, owners, distances), (displacements, level, low, sides, columns, moved),
+            (*field, basis), (network, (lanes, group, vectors, last_group, last_vectors)),
             (tables[0][worker], tables[1][worker], tables[2][worker]),
             (room[0][worker], room[1][worker], room[2][worker]),
-        )
+        )  # fmt: skip
         active, r, last, has_more = 0, 0, 0, True
         while True:
             while has_more and active < PLACES:

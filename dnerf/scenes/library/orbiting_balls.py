@@ -7,12 +7,9 @@ from dnerf.scenes.shapes import Ball, Vector
 from dnerf.scenes.textures import Checker, Lit, Plain, Plane, sector_planes
 
 PLANETS: tuple[tuple[Vector, float, float, float, float, float], ...] = (
-    (CORAL, 0.20, 0.72, 1.0, 0.00, 0.25),
-    (AMBER, 0.13, 0.68, 2.0, 0.45, -0.45),
-    (TEAL, 0.24, 1.00, -1.0, 0.30, -0.12),
-    (SKY, 0.10, 1.06, 2.0, 0.85, 0.50),
-    (LEAF, 0.15, 1.04, 1.0, 0.62, 0.16),
-)
+    (CORAL, 0.20, 0.72, 1.0, 0.00, 0.25), (AMBER, 0.13, 0.68, 2.0, 0.45, -0.45),
+    (TEAL, 0.24, 1.00, -1.0, 0.30, -0.12), (SKY, 0.10, 1.06, 2.0, 0.85, 0.50), (LEAF, 0.15, 1.04, 1.0, 0.62, 0.16),
+)  # fmt: skip
 """Colour, radius, radius of the orbit, turns, phase in turns and tilt in radians of each ball."""
 
 BANDS: tuple[Plane, ...] = (((0.0, 0.0, 1.0), -0.15), ((0.0, 0.0, 1.0), 0.15))

@@ -8,11 +8,9 @@ from dnerf.scenes.shapes import Ball, Vector
 from dnerf.scenes.textures import Glow
 
 CLOUDS: tuple[tuple[Vector, Vector, Vector, float, float, float], ...] = (
-    (AMBER, CORAL, (0.0, 0.0, 0.0), 0.62, 2.2, 0.0),
-    (SKY, INDIGO, (0.48, 0.42, 0.1), 0.40, 3.0, 0.5),
-    (CREAM, TEAL, (-0.50, 0.10, -0.22), 0.38, 3.0, 0.25),
-    (CORAL, PLUM, (0.05, -0.52, 0.18), 0.34, 3.4, 0.75),
-)
+    (AMBER, CORAL, (0.0, 0.0, 0.0), 0.62, 2.2, 0.0), (SKY, INDIGO, (0.48, 0.42, 0.1), 0.40, 3.0, 0.5),
+    (CREAM, TEAL, (-0.50, 0.10, -0.22), 0.38, 3.0, 0.25), (CORAL, PLUM, (0.05, -0.52, 0.18), 0.34, 3.4, 0.75),
+)  # fmt: skip
 """Core and rim colour, centre, radius, density and phase of the breath in turns of each cloud."""
 
 
