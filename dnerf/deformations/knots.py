@@ -26,8 +26,9 @@ def between_knots(deformation: Deformation, positions: Tensor, times: Tensor, sp
         share = ((arcs - first) / (last - first).clamp_(min=torch.finfo(arcs.dtype).tiny)).to(positions.dtype)
         places = torch.cat([places, places[-1:].expand(-len(places) % PAD_TO)])
         knots, at = positions.index_select(0, places), times.index_select(0, places)
-    displacements = deformation(knots, at) - knots
-    return positions + torch.lerp(*(displacements.index_select(0, i) for i in (before, after)), share[:, None])
+    moved = deformation(knots, at) - knots
+    first, last = (moved.index_select(0, i) for i in (before, after))
+    return positions + torch.lerp(first, last, share[:, None])
 
 
 def _knots(positions: Tensor, times: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
