@@ -12,7 +12,7 @@ from dnerf.deformations import unwrapped
 from dnerf.fields.base import HasRoughness, RadianceField, SignedDistance, surface_of
 from dnerf.fields.normals import differences
 from dnerf.losses.base import Batch, Loss
-from dnerf.losses.deformation import deformed, spread_numbers
+from dnerf.losses.deformation import deformed, saturated, spread_numbers
 from dnerf.nn.encodings import TimeEncoding
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import OccupancyAware
@@ -237,7 +237,7 @@ class EikonalLoss(PlacesLoss):
     At some of a batch's own samples, and at as many places spread over a box. The gradient is that of central
     differences over a cell of the finest open level of the grid: they reach into neighbouring cells, and need no second
     derivatives. At the samples surfaces should hardly bend within a cell, either: features that are linear in each cell
-    leave them rough by some degrees, which images hardly tell.
+    leave them rough by some degrees, which images hardly tell. That price is robust, since edges are folds.
 
     Source: IGR (arXiv 2002.10099) eq. 2; differences that follow the levels, and a price on second ones, from
     Neuralangelo (arXiv 2306.03092) sections 3.2 and 3.3. Deviation: theirs are not squared, and per unit of length.
@@ -247,18 +247,20 @@ class EikonalLoss(PlacesLoss):
         weight, every: see `Loss`.
         num_points: samples of each batch, and as many places in the box.
         bending: price of bends beside that of lengths: of the squared change of slopes over a cell.
+        saturation: squared change that no bend counts for more than, see `saturated`.
 
     Raises:
-        ValueError: for a box that is none, a negative weight or price, or no points.
+        ValueError: for a box that is none, or numbers out of range.
     """
 
     def __init__(
         self, box: Sequence[Sequence[float]], weight: float | Schedule = 3e-3, num_points: int = 256, *,
-        bending: float = 1.0, every: int = 1,
+        bending: float = 1.0, saturation: float = 0.3, every: int = 1,
     ) -> None:  # fmt: skip
         super().__init__(weight, num_points, dimensions=3, every=every)
         check_positive("bending", bending, allow_zero=True)
-        self.bending = bending
+        check_positive("saturation", saturation)
+        self.bending, self.saturation = bending, saturation
         self.box = nn.Buffer(as_box(box), persistent=False)
 
     def check(self, model: Renderer) -> None:
@@ -281,5 +283,5 @@ class EikonalLoss(PlacesLoss):
             times.append(extras["times"].reshape(-1)[chosen])
         gradients, bends = differences(surface, torch.cat(places), torch.cat(times), surface.detail)
         lengths = (gradients.norm(dim=-1) - 1).square().mean()
-        own = bends[self.num_points :]
+        own = saturated(bends[self.num_points :], self.saturation)
         return lengths + self.bending * own.mean() if own.numel() else lengths

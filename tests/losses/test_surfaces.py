@@ -39,11 +39,11 @@ def slope(factor: float) -> Slope:
     return field
 
 
-def term(field: RadianceField, bending: float = 0.0) -> Tensor:
+def term(field: RadianceField, bending: float = 0.0, saturation: float = 1e9) -> Tensor:
     z = torch.tensor([-0.1, 0.2])
     rays = Rays(torch.tensor([[0.0, 0, 2], [0.1, 0, 2]]), torch.tensor([[0.0, 0, -1]] * 2), z.abs(), 0 * z, 4 + 0 * z)
     model = Renderer(field, StratifiedSampler(16))
-    loss = EikonalLoss(BOX, bending=bending)
+    loss = EikonalLoss(BOX, bending=bending, saturation=saturation)
     loss.check(model)
     return loss(model(rays), NOTHING, model)
 
@@ -81,9 +81,10 @@ def test_bends_are_priced_at_the_samples_alone() -> None:
             return positions[..., 1].abs() + 0 * raw
 
     field = DeformedField(IdentityDeformation(), Fold(BOX, (4,), 2, max_rows=1024))
-    free, dear = (float(term(field, bending).detach()) for bending in (0.0, 3.0))
+    free, dear, robust = (float(term(field, *price).detach()) for price in ((0.0,), (3.0,), (3.0, 0.5)))
     # At a distance y of the fold slopes change by 2 (1 - |y| / h) over a step h; samples lie at y = 0.
     assert dear - free == pytest.approx(3.0 * 4, rel=1e-3)
+    assert robust - free == pytest.approx(3.0 * 4 / (1 + 4 / 0.5), rel=1e-3)
 
 
 def test_it_holds_in_canonical_space() -> None:
@@ -104,11 +105,14 @@ def test_differences_are_the_gradient_up_to_second_order() -> None:
     assert errors[1] < 0.3 * errors[0]
 
 
-def test_fields_without_a_surface_are_named() -> None:
+def test_fields_without_a_surface_and_bad_settings_are_named() -> None:
     grid = DeformedField(IdentityDeformation(), GridField(BOX, (4,), 2, max_rows=1024))
     assert canonical_surface(grid) is None
     with pytest.raises(ValueError, match="EikonalLoss needs a field with a signed distance, got DeformedField"):
         EikonalLoss(BOX).check(Renderer(grid, StratifiedSampler(8)))
+    for changes in ({"bending": -1.0}, {"saturation": 0.0}):
+        with pytest.raises(ValueError, match=f"{next(iter(changes))} must be"):
+            EikonalLoss(BOX, **changes)
 
 
 def test_unseen_insides_of_surfaces_are_not_emptied() -> None:

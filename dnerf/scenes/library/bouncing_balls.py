@@ -11,10 +11,8 @@ GRAVITY = 28.8
 """In world units per square of the film's length: an arc of height h takes sqrt(8 h / GRAVITY) of it."""
 
 BALLS: tuple[tuple[Vector, float, float, int, float], ...] = (
-    (TEAL, -0.55, -0.35, 2, 0.5),
-    (CORAL, 0.50, -0.40, 2, 0.2),
-    (AMBER, 0.00, 0.55, 3, 0.8),
-)
+    (TEAL, -0.55, -0.35, 2, 0.5), (CORAL, 0.50, -0.40, 2, 0.2), (AMBER, 0.00, 0.55, 3, 0.8),
+)  # fmt: skip
 """Colour, x, y, bounces while t goes from 0 to 1 and share of an arc that is over at t = 0 of each ball."""
 
 GROUND = -0.82
