@@ -30,7 +30,7 @@ class CachedDeformation(WrappedDeformation, PerFrame):
 
     A frame has one time, and displacements vary slowly in space: a lattice of them costs a few thousand evaluations,
     its samples would cost hundreds of thousands. The map is exact at vertices and linear in between, so the error
-    falls with the square of the cells' size (`at_time`). In training on a CPU rays interpolate them, too (`between_knots`).
+    falls with the square of the cells' size (`at_time`). In training on a CPU rays interpolate, too (`between_knots`).
 
     Args:
         deformation: world -> canonical.
