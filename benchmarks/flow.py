@@ -104,14 +104,11 @@ def _plot(rows: list[Row], field: str) -> Plot:
             )
         )
     return Plot(
-        name=field,
-        title=f"{field}: error of the solvers against evaluations",
-        x_label="evaluations of the velocity field",
-        y_label="largest error (world units)",
-        series=series,
+        name=field, title=f"{field}: error of the solvers against evaluations",
+        x_label="evaluations of the velocity field", y_label="largest error (world units)", series=series,
         note="Down and left is better. Solid: fixed steps; dashed: adaptive, from tolerance 1e-2 on the left. "
         f"Errors above {LOST:g} world units, the scene's own size, are left out.",
-    )
+    )  # fmt: skip
 
 
 def _costs_plot(rows: list[Row]) -> BarPlot:

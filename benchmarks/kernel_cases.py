@@ -145,12 +145,9 @@ def _grid_cases(work: Workload, n: int) -> list[Case]:
     # Backward: the features' gradient and the positions again, the rows again, both gradients written.
     backward = forward + features * n + 6 * n + work.used_bytes + work.table.nbytes
     return _both(
-        "grid_encode",
-        lambda p, t: grid_encode(p, t, work.levels),
-        lambda p, t: plain_grid_encode(p, t, work.levels),
-        (work.positions, work.table),
-        (forward, backward),
-    )
+        "grid_encode", lambda p, t: grid_encode(p, t, work.levels), lambda p, t: plain_grid_encode(p, t, work.levels),
+        (work.positions, work.table), (forward, backward),
+    )  # fmt: skip
 
 
 def _packed_cases(work: Workload, n: int) -> list[Case]:
@@ -215,12 +212,9 @@ def backends(call: Call) -> dict[str, Call]:
 
 
 def _both(
-    kernel: str,
-    function: Callable[..., Tensor],
-    plain: Callable[..., Tensor] | None,
-    inputs: Sequence[Tensor],
+    kernel: str, function: Callable[..., Tensor], plain: Callable[..., Tensor] | None, inputs: Sequence[Tensor],
     num_bytes: tuple[float, float],
-) -> list[Case]:
+) -> list[Case]:  # fmt: skip
     """A differentiable kernel's two cases; without a plain form where the definition is the quickest."""
     leaves = [x.detach().clone().requires_grad_() for x in inputs]
 

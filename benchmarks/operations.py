@@ -97,8 +97,6 @@ def total(work: Mapping[str, Work], names: set[str]) -> Work:
     """Sum over some operations."""
     chosen = [work[name] for name in work if name in names]
     return Work(
-        sum(w.calls for w in chosen),
-        sum(w.num_bytes for w in chosen),
-        sum(w.flops for w in chosen),
+        sum(w.calls for w in chosen), sum(w.num_bytes for w in chosen), sum(w.flops for w in chosen),
         sum(w.seconds for w in chosen),
-    )
+    )  # fmt: skip

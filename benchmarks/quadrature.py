@@ -167,11 +167,9 @@ def _exact_row(name: str, scene: AnalyticScene, rays: Rays, truth: Tensor) -> di
     output = scene(*samples.locate(rays))
     colors = composite(samples, FieldOutput(output.density, output.rgb), torch.ones(3)).rgb
     return {
-        "scene": name,
-        "method": "exact edges",
-        "samples_per_ray": len(samples.starts) / max(hits, 1),
+        "scene": name, "method": "exact edges", "samples_per_ray": len(samples.starts) / max(hits, 1),
         "rms_error": _error(colors, truth),
-    }
+    }  # fmt: skip
 
 
 def _plot(name: str, rows: list[dict[str, Any]], bound: float) -> Plot:
@@ -184,13 +182,10 @@ def _plot(name: str, rows: list[dict[str, Any]], bound: float) -> Plot:
         x, y = [row["samples_per_ray"] for row in part], [row["rms_error"] for row in part]
         series.append(Series(label, x, y, style=style))
     return Plot(
-        name=f"quadrature_{name}",
-        title=f"Error against samples per ray, {name}",
-        x_label="samples per ray",
-        y_label="root-mean-square error of colour",
-        series=series,
+        name=f"quadrature_{name}", title=f"Error against samples per ray, {name}", x_label="samples per ray",
+        y_label="root-mean-square error of colour", series=series,
         note=f"Float32; the truth's own error is below {bound:.0e}. Colours lie in [0, 1]: 2e-3 is half an 8-bit step.",
-    )
+    )  # fmt: skip
 
 
 def _order(rows: list[dict[str, Any]]) -> float:

@@ -12,11 +12,9 @@ from dnerf.core.rays import Rays
 from dnerf.fields.base import RadianceField
 
 CLOUDS = (
-    ((0.0, 0.0, 0.0), 0.34, 6.0),
-    ((0.5, 0.3, 0.1), 0.22, 10.0),
-    ((-0.4, 0.35, -0.2), 0.26, 4.0),
+    ((0.0, 0.0, 0.0), 0.34, 6.0), ((0.5, 0.3, 0.1), 0.22, 10.0), ((-0.4, 0.35, -0.2), 0.26, 4.0),
     ((0.1, -0.5, 0.25), 0.18, 14.0),
-)
+)  # fmt: skip
 """Centre, width (standard deviation) and peak density of each cloud."""
 
 

@@ -40,13 +40,10 @@ def main(config: DictConfig) -> None:
     ]
     text = write_report_text(
         title=config.title or f"{metrics[0].get('scene', folder.resolve().name)}: a dynamic radiance field",
-        metrics=metrics,
-        config=(folder / "config.yaml").read_text(encoding="utf-8"),
-        films=films,
-        sheets=sheets,
+        metrics=metrics, config=(folder / "config.yaml").read_text(encoding="utf-8"), films=films, sheets=sheets,
         temporal=_temporal(folder / "temporal.json"),
         plan=load_plan(folder / PLAN).rows() if (folder / PLAN).is_file() else [],
-    )
+    )  # fmt: skip
     output = Path(config.output or folder / "report.html")
     write_text(output, text)
     print(f"{len(films)} films, {len(sheets)} sheets, {len(text) / 2**20:.1f} MiB: {output}")

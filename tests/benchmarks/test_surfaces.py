@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.surfaces import _angle, _nearest, _volume
+from benchmarks.surfaces import _angle, _nearest, _seen, _volume
 from dnerf.core.cameras import Camera, Intrinsics, look_at
 from dnerf.core.compositing import FieldOutput
 from dnerf.fields import RadianceField, SignedDistance
@@ -50,5 +50,7 @@ def test_a_ball_s_volume_distance_and_normals(aside: float) -> None:
     assert _nearest(mesh.vertices, mesh.vertices) == pytest.approx(0, abs=1e-3)
     assert _nearest(mesh.vertices + 10.0, mesh.vertices) == pytest.approx(300**0.5, rel=0.05)
     camera = Camera(Intrinsics.from_angle(24, 24, 0.5), look_at((3.0, 0.0, 0.0)), 2.0, 4.0)
+    feet = torch.nn.functional.normalize(mesh.vertices, dim=-1)[:, 0]  # a ball is seen up to where rays touch it
+    assert (_seen(SCENE, mesh.vertices, [camera], 0.5) == (feet > 1 / 6))[(feet - 1 / 6).abs() > 0.01].all()
     angle = _angle(Renderer(field, StratifiedSampler(800)).eval(), SCENE, camera, 0.5)
     assert angle == pytest.approx(0, abs=0.6) if aside == 0 else 0 < angle < math.degrees(0.02 / 0.5)

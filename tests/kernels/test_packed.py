@@ -49,11 +49,9 @@ def test_reference_equals_loop(reference):
 
 @settings(max_examples=20, deadline=None)
 @given(
-    counts=st.lists(st.integers(0, 60), max_size=8),
-    scale=st.sampled_from([0.0, 1e-9, 0.1, 30.0]),
-    num_columns=st.integers(1, 9),
-    weighted=st.booleans(),
-)
+    counts=st.lists(st.integers(0, 60), max_size=8), scale=st.sampled_from([0.0, 1e-9, 0.1, 30.0]),
+    num_columns=st.integers(1, 9), weighted=st.booleans(),
+)  # fmt: skip
 def test_numba_agrees_with_reference_on_random_rays(counts, scale, num_columns, weighted):
     depths, values, weights, offsets = packed(counts, scale, num_columns=num_columns)
     summing = (packed_sum, values, weights if weighted else None, offsets)
