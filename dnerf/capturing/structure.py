@@ -18,6 +18,7 @@ from dnerf.data.images import read_mask
 
 LENSES = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 MATCHINGS = ("auto", "sequential", "exhaustive")
+ROBUST = 0.3  # pixels, about the noise of a feature's place: larger errors weigh less and less
 BATCH = 100  # pairs between two looks at the progress bar
 LEAST_FEATURES = 60  # in the median frame
 LEAST_INLIERS = 15  # of a pair that shows the same
@@ -163,7 +164,22 @@ def _map(database: Path, images: Path, unfinished: Path, num_frames: int) -> lis
             database, images, unfinished, options=options, next_image_callback=lambda: bar.update(1)
         )
     shutil.rmtree(unfinished)
+    for model in models.values():
+        _refine(model)
     return list(models.values())
+
+
+def _refine(model: Any) -> None:
+    """Adjust cameras and points once more, by errors whose tails hardly count: what moves has matches, too."""
+    pycolmap = load_pycolmap()
+    options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = ROBUST
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()  # its short form writes to the log
+    model.update_point_3d_errors()
 
 
 def keep_good_points(model: Any) -> None:

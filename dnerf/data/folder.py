@@ -105,12 +105,13 @@ class FolderData(DataSource):
         similarity, result = self.world().similarity, {}
         for split, frames in self._split.splits.items():
             have_images = any(frame.image is not None for frame in frames)
-            kept = [frame for frame in self._read_of(split) if _is_there(frame)] if split == "train" else frames
+            if split == "train":
+                frames = tuple(f for f in self._read_of(split) if f.image is not None and f.image.path.exists())
             shared: dict[Intrinsics, Intrinsics] = {}
-            lenses = (self._lens(final_intrinsics(frame, self.resolution)) for frame in kept)
+            lenses = (self._lens(final_intrinsics(frame, self.resolution)) for frame in frames)
             result[split] = CameraSet(
-                similarity.poses_to_world(_poses(kept)).float(), _times(kept),
-                tuple(shared.setdefault(lens, lens) for lens in lenses), tuple(frame.name for frame in kept),
+                similarity.poses_to_world(_poses(frames)).float(), _times(frames),
+                tuple(shared.setdefault(lens, lens) for lens in lenses), tuple(frame.name for frame in frames),
                 have_images,
             )  # fmt: skip
         return result
@@ -194,10 +195,6 @@ def _show_something(images: Tensor) -> bool:
     """Whether any pixel differs from the first; what is larger than memory is read as far as is needed only."""
     pixels = images.flatten(0, -2)
     return any(bool((part != pixels[0]).any()) for part in pixels.split(PIXELS))
-
-
-def _is_there(frame: CaptureFrame) -> bool:
-    return frame.image is not None and frame.image.path.exists()
 
 
 def _poses(frames: Sequence[CaptureFrame]) -> Tensor:

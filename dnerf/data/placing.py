@@ -169,10 +169,7 @@ def _about_planes(frames: Frames, world: World) -> str:
 
 
 def _cut_off(frames: Frames, world: World, given: Given, fitted: tuple[Similarity, Box]) -> list[str]:
-    """Where given settings leave out what the images show, as sentences for warnings.
-
-    Only images with alpha, or before one colour, tell.
-    """
+    """Where given settings leave out what images with alpha, or before one colour, show: sentences for warnings."""
     behind = None if frames.is_transparent else background_color(frames)
     if not frames.is_transparent and behind is None:
         return []

@@ -131,10 +131,7 @@ def write_gltf(
     gltf.extensionsUsed = [] if lit else [UNLIT]
     turn = imported("scipy.spatial.transform").Rotation.from_matrix(TO_Y_UP)
     turn = turn * imported("scipy.spatial.transform").Rotation.from_matrix(similarity.rotation)
-    gltf.nodes = [
-        lib.Node(name="y is up", rotation=turn.as_quat().tolist(), children=[1]),
-        lib.Node(name="surface", mesh=0),
-    ]
+    gltf.nodes = [lib.Node(name="y is up", rotation=turn.as_quat().tolist(), children=[1]), lib.Node(mesh=0)]
     if targets:
         seconds, weights = torch.tensor(keys)[:, None] / fps, torch.eye(len(keys))[:, 1:].reshape(-1, 1)
         sampler = lib.AnimationSampler(input=add(seconds), output=add(weights), interpolation=interpolation.upper())

@@ -215,10 +215,6 @@ def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> N
 
 
 def _write_folder(frames: Iterator[NDArray[np.uint8]], path: Path) -> None:
-    with replaced_folder(path, _is_frame) as folder:
+    with replaced_folder(path, lambda name: name.startswith("frame_") and name.endswith(".png")) as folder:
         for index, frame in enumerate(frames):
             Image.fromarray(frame).save(folder / f"frame_{index:05d}.png")
-
-
-def _is_frame(name: str) -> bool:
-    return name.startswith("frame_") and name.endswith(".png")

@@ -53,8 +53,8 @@ def test_cameras_of_a_film_are_found(captured: Path, filmed) -> None:
     assert len(frames) >= 0.95 * COUNT
     truth = filmed[1].double()[[int(Path(frame.name).name) for frame in frames]]
     found = torch.tensor([frame.pose for frame in frames], dtype=torch.float64)
-    # Of a quarter of the film, at two thirds of its width; the whole film has 0.18 degrees.
-    assert rotation_errors(found[:, :3, :3], truth[:, :3, :3]).median() < 0.5
+    # Of a quarter of the film, at two thirds of its width. Without the last adjustment it has 0.6 to 0.8 degrees.
+    assert rotation_errors(found[:, :3, :3], truth[:, :3, :3]).median() < 0.3
     assert frames[0].intrinsics.focal_x == pytest.approx(phone_lens(SIZE).focal_x, rel=0.03)
     assert [frame.time for frame in frames] == pytest.approx([int(Path(f.name).name) / 15 for f in frames], abs=1e-5)
 

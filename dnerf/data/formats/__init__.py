@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dnerf.core.checks import check_choice
-from dnerf.data.capture import Capture, CaptureFrame
+from dnerf.data.capture import Capture
 from dnerf.data.formats import blender, colmap, llff, nerfies, rig, transforms
 from dnerf.data.formats.axes import check_axes
 from dnerf.data.formats.poses import as_pose, from_opencv
@@ -81,7 +81,10 @@ def _read(root: Path, format: str, axes: str) -> Capture:
         raise ValueError(f"axes must be auto or opengl: the format {name} says what a pose's axes are, got opencv")
     capture = reader.read(root)
     if axes == "opencv":
-        splits = {split: tuple(map(_from_opencv, frames)) for split, frames in capture.splits.items()}
+        splits = {
+            split: tuple(replace(f, pose=as_pose(from_opencv(np.array(f.pose)))) for f in frames)
+            for split, frames in capture.splits.items()
+        }
         capture = replace(capture, splits=splits)
     elif axes == "auto" and not reader.fixed_axes:
         check_axes(capture)
@@ -90,10 +93,6 @@ def _read(root: Path, format: str, axes: str) -> Capture:
         note = f"{root}: read as {name}; it could be read with data.format={' or '.join(others)}, too"
         capture = replace(capture, notes=(note, *capture.notes))
     return capture
-
-
-def _from_opencv(frame: CaptureFrame) -> CaptureFrame:
-    return replace(frame, pose=as_pose(from_opencv(np.array(frame.pose))))
 
 
 def _not_recognised(root: Path) -> str:
