@@ -82,7 +82,11 @@ def capture(
 
         found = stages.result("structure", [of_features, settings.matching, min_share, given], find)
         cameras = colmap.read(out_dir).splits["all"]
-        _write_manifest(cameras, frames, out_dir)
+        times = {frame.name.removesuffix(".png"): frame.time for frame in frames}
+        poses = ((f"images/{c.name}.png", times[c.name], c.pose) for c in cameras)
+        listed = [{"file_path": path, "time": time, "transform_matrix": pose} for path, time, pose in poses]
+        fields = transforms_fields(listed, [camera.intrinsics for camera in cameras], {"ply_file_path": POINTS})
+        write_json(out_dir / MANIFEST, fields)
     return _report(found, cameras, out_dir)
 
 
@@ -144,13 +148,6 @@ def _keep(models: Sequence[Any], num_frames: int, min_share: float, out_dir: Pat
     with atomic_path(out_dir / POINTS) as temporary:
         model.export_PLY(temporary)
     return found | {"points": model.num_points3D()}
-
-
-def _write_manifest(cameras: Sequence[CaptureFrame], frames: Sequence[ChosenFrame], out_dir: Path) -> None:
-    times = {frame.name.removesuffix(".png"): frame.time for frame in frames}
-    listed = [{"file_path": f"images/{c.name}.png", "time": times[c.name], "transform_matrix": c.pose} for c in cameras]
-    fields = transforms_fields(listed, [camera.intrinsics for camera in cameras], {"ply_file_path": POINTS})
-    write_json(out_dir / MANIFEST, fields)
 
 
 def _report(found: dict[str, Any], cameras: Sequence[CaptureFrame], folder: Path) -> list[str]:

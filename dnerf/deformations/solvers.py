@@ -69,7 +69,10 @@ class Solver:
 
         # Steps end where the way ends: torchdiffeq would step past it and interpolate, to fourth order only, which is
         # all that a loose dopri8 would then be.
-        options = {"norm": _worst_point, "max_num_steps": self.max_steps, "step_t": torch.tensor([0.0, 1.0])}
+        options = {
+            "norm": lambda values: values.square().mean(-1).amax().sqrt(),  # of the worst point
+            "max_num_steps": self.max_steps, "step_t": torch.tensor([0.0, 1.0]),
+        }  # fmt: skip
         interval = torch.tensor([0.0, 1.0], dtype=positions.dtype, device=positions.device)
         tolerances = {"rtol": self.rtol, "atol": self.atol}
         return odeint(right_hand_side, positions, interval, method=self.name, options=options, **tolerances)[-1]
@@ -94,11 +97,6 @@ def _increment(name: str, f: RightHandSide, x: Tensor, s: float, h: float) -> Te
     third = f(s + 2 * h / 3, x + h * (second - first / 3))
     fourth = f(s + h, x + h * (first - second + third))
     return (first + 3 * (second + third) + fourth) / 8
-
-
-def _worst_point(values: Tensor) -> Tensor:
-    """Largest root mean square over the last axis."""
-    return values.square().mean(-1).amax().sqrt()
 
 
 def failure(

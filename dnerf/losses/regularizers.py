@@ -120,10 +120,11 @@ class UnseenSpaceLoss(PlacesLoss):
 class DistortionLoss(Loss):
     """Spread of the weights along each ray: one surface costs least, floaters in front of it cost more.
 
-    `sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 l_i / 3`, the mean over rays, for weights w of samples at distances m, and
-    lengths l of their intervals.
+    `o (sum_ij v_i v_j |m_i - m_j| + sum_i v_i^2 l_i / 3)`, the mean over rays, for shares v = w / o of samples at
+    distances m, lengths l of their intervals, weights w and the opacity o = sum_i w_i, which gets no gradient.
 
-    Source: mip-NeRF 360 (arXiv 2111.12077) eq. 15, with distances in world units.
+    Source: mip-NeRF 360 (arXiv 2111.12077) eq. 15, with distances in world units. Deviation: there all of a ray's light
+    ends in samples. Here it may end behind them, where nothing costs; so the price is of the spread, not of the light.
     """
 
     def forward(self, rendering: Rendering, batch: Batch, model: Renderer) -> Tensor:
@@ -134,6 +135,8 @@ class DistortionLoss(Loss):
         moments = weights * samples.distances
         pairs = 2 * (moments * sums_before(weights, samples) - weights * sums_before(moments, samples))
         spread = sum_along_rays(pairs + weights.square() * samples.lengths / 3, samples)
+        opacity = sum_along_rays(weights, samples)
+        spread = spread / opacity.clamp(min=VISIBLE_WEIGHT).square() * opacity.detach()
         return rendering.mean(spread).to(rendering.rgb.dtype)
 
 

@@ -18,7 +18,8 @@ from dnerf.training.trainer import Trainer
 Maker = Callable[[Mapping[str, str]], tuple[Renderer, Trainer]]
 """The model and the trainer for choices of candidates by part."""
 
-HELD_SHARE = 0.125  # of the frames
+HELD = (8, 4, 2)  # one frame of so many is held out: of the most that leave
+LEAST_HELD = 3  # frames to compare on; one has no standard error
 LEAST_FRAMES = 8  # of the training split, below which none is held out
 NUM_RAYS = 8192  # of a comparison
 SPAN = 0.05  # of all steps done, over which weights are averaged for a comparison: steps of one size are noisy
@@ -134,9 +135,9 @@ def split_frames(frames: Frames) -> tuple[Frames, Frames] | None:
     """Frames to train on and frames to compare on, spread in time and over the cameras of a rig; None for too few."""
     if len(frames) < LEAST_FRAMES:
         return None
-    every = round(1 / HELD_SHARE)
+    every = next(number for number in HELD if len(frames) >= LEAST_HELD * number)
     order = frames.times.argsort(stable=True).tolist()
-    # One of each eight, another each time: of four cameras that take turns, every eighth frame is the same one's.
+    # Another of each eight: of four cameras that take turns, every eighth frame is the same one's.
     places = (start + (every // 2 + 3 * (start // every)) % every for start in range(0, len(order), every))
     held = [order[place] for place in places if place < len(order)]
     return frames.subset([i for i in range(len(frames)) if i not in set(held)]), frames.subset(held)

@@ -478,24 +478,18 @@ def composite_shapes(density: tuple[int, ...], rgb: tuple[int, ...], background:
     )
 
 
+PAIR = uniform(0, 1, 4, num_rays=2)
+
+
 @pytest.mark.parametrize(("call", "message"), [
     (lambda: composite_shapes((2, 3), (2, 4, 3), (3,)), "density must have shape (2, 4), got (2, 3)"),
     (lambda: composite_shapes((2, 4, 1), (2, 4, 3), (3,)), "density must have shape (2, 4), got (2, 4, 1)"),
     (lambda: composite_shapes((2, 4), (2, 4), (3,)), "rgb must have shape (2, 4, 3), got (2, 4)"),
     (lambda: composite_shapes((2, 4), (2, 4, 3), (4, 3)), "background must have shape (2, 3), got (4, 3)"),
     (lambda: composite_shapes((2, 4), (2, 4, 3), (1,)), "background must have shape (2, 3), got (1,)"),
-    (
-        lambda: render_weights(torch.ones(8), uniform(0, 1, 4, num_rays=2)),
-        "optical_depth must have shape (2, 4), got (8,)",
-    ),
-    (
-        lambda: sum_along_rays(torch.ones(4, 2), uniform(0, 1, 4, num_rays=2)),
-        "values must have shape (2, 4, ...), got (4, 2)",
-    ),
-    (
-        lambda: sum_along_rays(torch.ones(2, 4), uniform(0, 1, 4, num_rays=2), torch.ones(2)),
-        "weights must have shape (2, 4), got (2,)",
-    ),
+    (lambda: render_weights(torch.ones(8), PAIR), "optical_depth must have shape (2, 4), got (8,)"),
+    (lambda: sum_along_rays(torch.ones(4, 2), PAIR), "values must have shape (2, 4, ...), got (4, 2)"),
+    (lambda: sum_along_rays(torch.ones(2, 4), PAIR, torch.ones(2)), "weights must have shape (2, 4), got (2,)"),
 ])  # fmt: skip
 def test_shapes_that_do_not_fit_are_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError) as error:
