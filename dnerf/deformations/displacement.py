@@ -28,7 +28,6 @@ class DisplacementDeformation(Deformation, DeclaresGroups):
         canonical_time: t0 in [0, 1], or None.
         window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
         time_embeddings: learnt embeddings of time, half as many as frames at most (`TimeEncoding`); 0 for none.
-        embedding_features: how many of each.
 
     Raises:
         ValueError: if the canonical time lies outside [0, 1], for one embedding, or a number of features out of range.
@@ -39,14 +38,14 @@ class DisplacementDeformation(Deformation, DeclaresGroups):
     def __init__(
         self, num_layers: int = 8, hidden_features: int = 256, skips: Sequence[int] = (), *,
         position_frequencies: int = 10, time_frequencies: int = 10, canonical_time: float | None = 0.0,
-        window_end: float | None = None, time_embeddings: int = 0, embedding_features: int = 4,
+        window_end: float | None = None, time_embeddings: int = 0,
     ) -> None:  # fmt: skip
         super().__init__()
         if canonical_time is not None and not 0 <= canonical_time <= 1:
             raise ValueError(f"canonical_time must be in [0, 1] or None, got {canonical_time}")
         self.canonical_time = canonical_time
         self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
-        self.encode_times = TimeEncoding(time_frequencies, time_embeddings, embedding_features)
+        self.encode_times = TimeEncoding(time_frequencies, time_embeddings)
         self.mlp = MLP(
             self.encode_positions.out_features + self.encode_times.out_features, hidden_features, num_layers,
             out_features=self.NUM_OUTPUTS, skips=skips, zero_output=True,

@@ -103,7 +103,6 @@ class NetworkVelocity(Velocity):
         fade, smoothness: see `BoxWindow`.
         window_end: fraction of training at which all octaves of position are in, see `SinusoidalEncoding`.
         time_embeddings: learnt embeddings of time, half as many as frames at most (`TimeEncoding`); 0 for none.
-        embedding_features: how many of each.
 
     Raises:
         ValueError: for numbers out of range.
@@ -112,13 +111,13 @@ class NetworkVelocity(Velocity):
     def __init__(
         self, box: Sequence[Sequence[float]], num_layers: int = 3, hidden_features: int = 64, *,
         position_frequencies: int = 3, time_frequencies: int = 5, activation: str = "silu", fade: float = 0.1,
-        smoothness: int = 4, window_end: float | None = None, time_embeddings: int = 0, embedding_features: int = 4,
+        smoothness: int = 4, window_end: float | None = None, time_embeddings: int = 0,
     ) -> None:  # fmt: skip
         super().__init__()
         check_positive("num_layers", num_layers)
         self.window = BoxWindow(box, fade, smoothness)
         self.encode_positions = SinusoidalEncoding(3, position_frequencies, window_end=window_end)
-        self.encode_times = TimeEncoding(time_frequencies, time_embeddings, embedding_features)
+        self.encode_times = TimeEncoding(time_frequencies, time_embeddings)
         self.mlp = MLP(
             self.encode_positions.out_features + self.encode_times.out_features, hidden_features, num_layers,
             out_features=3, zero_output=True, activation=activation,

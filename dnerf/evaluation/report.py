@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dnerf.data.videos import read_video_header
 from dnerf.evaluation.plots import frame_curves
 from dnerf.evaluation.protocols import cell, filled_columns
 
@@ -110,18 +111,9 @@ def read_scores(folder: Path) -> list[dict[str, Any]]:
 def _film(path: Path) -> dict[str, str]:
     kind = "video" if path.suffix.lower() == ".mp4" else "image"
     note = FILM_NOTES.get(path.stem.rpartition("_")[2], "")
-    wide = "wide" if kind == "video" and _is_wide(path.read_bytes()) else ""
+    width, height = read_video_header(path)[:2] if kind == "video" else (1, 1)
+    wide = "wide" if width > 2 * height else ""
     return {"uri": data_uri(path), "kind": kind, "caption": path.stem.replace("_", " "), "note": note, "wide": wide}
-
-
-def _is_wide(film: bytes) -> bool:
-    """Whether an MP4 file is more than twice as wide as high, by its first track's header (ISO 14496-12, 8.3.2)."""
-    start = film.find(b"tkhd") + 4
-    if start < 4 or len(film) < start + 96:
-        return False
-    sizes = start + (88 if film[start] == 1 else 76)
-    width, height = (int.from_bytes(film[at : at + 4], "big") for at in (sizes, sizes + 4))
-    return width > 2 * height
 
 
 def _curve(metrics: Mapping[str, Any]) -> dict[str, str]:

@@ -18,6 +18,7 @@ NUM_DISTANCES = 64  # along each ray
 REACH = 1  # blocks of pixels by which outlines may be off
 NOT_CLEAR = 2  # alpha, of 255, from which a pixel shows something, be it fog
 AGREEMENT = 0.98  # share of the views in which one position is not empty, so that a body at rest explains a ray
+LEAST_CAMERAS = 3  # of a rig, to see a body from several sides
 MAX_CAMERAS = 8  # that do not move, as rigs for tomography have: more tell what is thin from what is dark
 MIXTURES = 0.995  # share of the pixels: some of a compressed film have other colours
 CELLS = {"coarse": 64, "medium": 128, "fine": 256, "finest": 512}  # of a grid's last level
@@ -112,6 +113,17 @@ class ColorsEvidence(Evidence):
         if mixture_share(frames, behind) < MIXTURES:
             return Finding("many", "the images have colours that no single one makes")
         return Finding("one", f"all pixels are mixtures of the background and one colour, for {cameras} cameras")
+
+
+class AppearanceEvidence(Evidence):
+    """Whether appearance may change while it moves: "carried" for a film, whose camera sees one side at a moment."""
+
+    def find(self, frames: Frames, box: torch.Tensor) -> Finding | None:
+        """See `Evidence.find`; None for a scene that stands alone, and for a rig."""
+        is_alone = SurroundingsEvidence().find(frames, box).choice == "alone"
+        if is_alone or len(rig_places(frames.poses[:, :3, 3])) >= LEAST_CAMERAS:
+            return None
+        return Finding("carried", "few cameras see a place at a moment")
 
 
 class ExposureEvidence(Evidence):

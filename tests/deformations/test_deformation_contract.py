@@ -36,9 +36,7 @@ DEFORMATIONS: dict[str, Callable[[], Deformation]] = {
     "displacement, no canonical time": lambda: DisplacementDeformation(2, 16, (), canonical_time=None),
     "displacement, canonical time 0.5": lambda: DisplacementDeformation(2, 16, (), canonical_time=0.5),
     "displacement, windowed": lambda: DisplacementDeformation(2, 16, (), window_end=0.5),
-    "displacement, time embeddings": lambda: DisplacementDeformation(
-        2, 16, (), time_embeddings=5, embedding_features=2
-    ),
+    "displacement, time embeddings": lambda: DisplacementDeformation(2, 16, (), time_embeddings=5),
     "se3": lambda: SE3Deformation(2, 16, (), position_frequencies=2, canonical_time=None),
     "se3, canonical time": lambda: SE3Deformation(2, 16, (), position_frequencies=2),
     "flow": lambda: FlowDeformation(network_velocity(), 0.5),

@@ -239,11 +239,11 @@ def test_layers_of_voxels_that_cost_go_on_where_a_loss_that_is_loaded_was() -> N
 
 def of_embeddings(values: list[float]) -> tuple[Renderer, torch.nn.Parameter]:
     """A model whose deformation has learnt one feature of as many times, and these."""
-    deformation = DisplacementDeformation(1, 8, (), time_embeddings=len(values), embedding_features=1)
+    deformation = DisplacementDeformation(1, 8, (), time_embeddings=len(values))
     embeddings = deformation.encode_times.embeddings
     assert embeddings is not None
     with torch.no_grad():
-        embeddings[:, 0] = torch.tensor(values)
+        embeddings.copy_(torch.tensor(values)[:, None].expand_as(embeddings))
     return Renderer(DeformedField(deformation, fog()), StratifiedSampler(4)), embeddings
 
 

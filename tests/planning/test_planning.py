@@ -18,6 +18,7 @@ from dnerf.data.bounds import fit_box
 from dnerf.fields import GridField
 from dnerf.planning import Decision, Evidence, Finding, Part, Plan, make_plan
 from dnerf.planning.evidence import (
+    AppearanceEvidence,
     ColorsEvidence,
     DetailEvidence,
     ExposureEvidence,
@@ -208,7 +209,12 @@ def test_images_that_show_something_everywhere_have_surroundings() -> None:
     opaque = replace(frames, images=frames.images[..., :3].contiguous())
     assert SurroundingsEvidence().find(opaque, BOX).choice == "alone"  # before white, or black
     noise = torch.randint(256, opaque.images.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    assert SurroundingsEvidence().find(replace(opaque, images=noise), BOX).choice == "surrounded"
+    film = replace(opaque, images=noise)
+    assert SurroundingsEvidence().find(film, BOX).choice == "surrounded"
+    said = [
+        AppearanceEvidence().find(x, BOX) for x in (film, frames, replace(film, poses=film.poses[[0, 1, 2, 0] * 2]))
+    ]
+    assert said == [Finding("carried", "few cameras see a place at a moment"), None, None]
 
 
 @pytest.mark.parametrize(
