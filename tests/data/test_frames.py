@@ -272,10 +272,7 @@ def bad_pose(**entries: float) -> Tensor:
     ({"background": "white"}, "background must be None"),
     ({"names": ("a",)}, "names must be 3"),
     ({"intrinsics": (INTRINSICS,) * 2}, "intrinsics must be one, or 3 as there are times, got 2"),
-    (
-        {"intrinsics": (INTRINSICS, INTRINSICS, Intrinsics(4, 4, 6.0, 7.0))},
-        r"images must have shape \(56, 3 or 4\)",
-    ),
+    ({"intrinsics": (INTRINSICS, INTRINSICS, Intrinsics(4, 4, 6.0, 7.0))}, r"images must have shape \(56, 3 or 4\)"),
     ({"channels": 3, "background": "pink"}, "color must be"),
 ])  # fmt: skip
 def test_what_does_not_fit_is_refused(changes: dict, message: str) -> None:

@@ -138,10 +138,7 @@ def test_bad_text_is_named_in_one_line(root: Path, file: str, content: str, mess
         "points of an image must be at most .* got 18446744073709551615",
     ),
     ("points3D.bin", struct.pack("<Q", 2**40) + bytes(51), "points must be at most .* and within the file"),
-    (
-        "points3D.bin", struct.pack("<Q", 1) + bytes(43) + struct.pack("<Q", 2**60),
-        "track of a point must be at most",
-    ),
+    ("points3D.bin", struct.pack("<Q", 1) + bytes(43) + struct.pack("<Q", 2**60), "track of a point must be at most"),
 ])  # fmt: skip
 def test_absurd_lengths_in_binary_models_are_refused_at_once(
     binary: Path, file: str, content: bytes, message: str
