@@ -113,8 +113,7 @@ class FlowDeformation(InvertibleDeformation):
         try:
             result = self.solver.solve(watched, positions)
             # A graph that is recorded reads nothing; what is not finite then shows in the loss.
-            is_recorded = result.is_cuda and torch.cuda.is_current_stream_capturing()
-            if is_recorded or bool(torch.isfinite(result).all()):
+            if _is_recorded(result) or bool(torch.isfinite(result).all()):
                 return result
         except AssertionError as error:
             problem = f"the solver stopped ({error})"
@@ -135,6 +134,10 @@ class FlowDeformation(InvertibleDeformation):
             field = self.velocity.at(start)
             return lambda s, positions: column * field(positions)
         return lambda s, positions: column * self.velocity(positions, start + s * spans)
+
+
+def _is_recorded(values: Tensor) -> bool:
+    return values.is_cuda and torch.cuda.is_current_stream_capturing()
 
 
 class FlowChain(InvertibleDeformation):

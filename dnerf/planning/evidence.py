@@ -121,9 +121,8 @@ class AppearanceEvidence(Evidence):
     def find(self, frames: Frames, box: torch.Tensor) -> Finding | None:
         """See `Evidence.find`; None for a scene that stands alone, and for a rig."""
         is_alone = SurroundingsEvidence().find(frames, box).choice == "alone"
-        if is_alone or len(rig_places(frames.poses[:, :3, 3])) >= LEAST_CAMERAS:
-            return None
-        return Finding("carried", "few cameras see a place at a moment")
+        is_open = is_alone or len(rig_places(frames.poses[:, :3, 3])) >= LEAST_CAMERAS
+        return None if is_open else Finding("carried", "few cameras see a place at a moment")
 
 
 class ExposureEvidence(Evidence):

@@ -157,10 +157,8 @@ def gain(better: Tensor, worse: Tensor) -> tuple[float, float]:
     share = worse / worse.sum().clamp(min=1e-30)  # of the whole error: a frame without any says nothing
     mean = float((share * differences).sum())
     count = len(share)
-    if count < 2:
-        return mean, math.inf
     spread = float((share.square() * (differences - mean).square()).sum().sqrt())
-    return mean, spread * math.sqrt(count / (count - 1))  # the mean is theirs
+    return mean, spread * math.sqrt(count / (count - 1)) if count > 1 else math.inf  # the mean is theirs
 
 
 @dataclass(frozen=True)
