@@ -83,10 +83,11 @@ def capture(
         found = stages.result("structure", [of_features, settings.matching, min_share, given], find)
         cameras = colmap.read(out_dir).splits["all"]
         times = {frame.name.removesuffix(".png"): frame.time for frame in frames}
-        poses = ((f"images/{c.name}.png", times[c.name], c.pose) for c in cameras)
-        listed = [{"file_path": path, "time": time, "transform_matrix": pose} for path, time, pose in poses]
-        fields = transforms_fields(listed, [camera.intrinsics for camera in cameras], {"ply_file_path": POINTS})
-        write_json(out_dir / MANIFEST, fields)
+        listed = [
+            {"file_path": f"images/{c.name}.png", "time": times[c.name], "transform_matrix": c.pose} for c in cameras
+        ]
+        lenses, points = [camera.intrinsics for camera in cameras], {"ply_file_path": POINTS}
+        write_json(out_dir / MANIFEST, transforms_fields(listed, lenses, points))
     return _report(found, cameras, out_dir)
 
 

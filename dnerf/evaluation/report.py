@@ -111,8 +111,7 @@ def read_scores(folder: Path) -> list[dict[str, Any]]:
 def _film(path: Path) -> dict[str, str]:
     kind = "video" if path.suffix.lower() == ".mp4" else "image"
     note = FILM_NOTES.get(path.stem.rpartition("_")[2], "")
-    width, height = read_video_header(path)[:2] if kind == "video" else (1, 1)
-    wide = "wide" if width > 2 * height else ""
+    wide = "wide" if kind == "video" and (film := read_video_header(path)).width > 2 * film.height else ""
     return {"uri": data_uri(path), "kind": kind, "caption": path.stem.replace("_", " "), "note": note, "wide": wide}
 
 

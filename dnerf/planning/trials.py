@@ -18,7 +18,7 @@ from dnerf.training.trainer import Trainer
 Maker = Callable[[Mapping[str, str]], tuple[Renderer, Trainer]]
 """The model and the trainer for choices of candidates by part."""
 
-HELD = (8, 4, 2)  # one frame of so many is held out: of the most that leave
+HELD = (8, 4, 3, 2)  # one frame of so many is held out, of the most that give `LEAST_HELD`
 LEAST_HELD = 3  # frames to compare on; one has no standard error
 LEAST_FRAMES = 8  # of the training split, below which none is held out
 NUM_RAYS = 8192  # of a comparison
