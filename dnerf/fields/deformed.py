@@ -21,7 +21,7 @@ from dnerf.fields.base import (
     surface_of,
     warn_of_generic_path,
 )
-from dnerf.kernels import FrameTables, MarchGrid, is_bfloat16_wanted, is_traced
+from dnerf.kernels import FrameTables, MarchGrid, get_backend, is_traced
 
 
 class DeformedField(RadianceField, IntervalAware, SignedDistance):
@@ -126,7 +126,7 @@ class StillField(DeformedField, FrameTabled):
 
 def _frame_tables(canonical: RadianceField, grid: MarchGrid, **lattice: Tensor) -> FrameTables | None:
     """Of a field in canonical space behind a lattice of displacements."""
-    if not (grid.aabb.is_cpu and is_bfloat16_wanted(grid.aabb)):
+    if not grid.aabb.is_cpu or get_backend() == "reference":
         return None
     if not isinstance(canonical, NetworkTabled) or not speaks_for(canonical, "network_tables", "forward"):
         return warn_of_generic_path(f"a canonical {type(canonical).__name__}")
@@ -135,7 +135,7 @@ def _frame_tables(canonical: RadianceField, grid: MarchGrid, **lattice: Tensor) 
         return None
     if not is_traced(network.table, network.weights[0].shape[1], network.weights):
         widths = [network.weights[0].shape[1], *map(len, network.weights)]
-        return warn_of_generic_path(f"layers of widths {widths} here: hidden ones in multiples of 16, on AVX512-BF16")
+        return warn_of_generic_path(f"layers of widths {widths} here: hidden ones in multiples of 16")
     return FrameTables(
         occupancy=grid.occupancy, skips=grid.skips, aabb=grid.aabb, field_low=network.low, field_scale=network.scale,
         table=network.table, shifts=network.shifts, levels=network.levels, weights=network.weights,

@@ -10,7 +10,7 @@ from dnerf.core.checks import check_shape
 from .backend import choose, run_compiled
 from .grid_encode import GridLevels, check_grid, grid_encode
 from .op import op
-from .relu_layers import is_bfloat16_wanted, relu_layers
+from .relu_layers import is_bfloat16_wanted, is_plain, relu_layers
 
 
 @torch.no_grad()
@@ -19,9 +19,9 @@ def grid_network(
 ) -> Tensor:
     """`relu_layers` of `grid_encode`, and a last linear layer: W x + b. Not differentiable.
 
-    Under autocast to bfloat16, on CPUs that multiply vectors in it but no tiles (AMX), features and what is between
-    layers never leave the nearest caches: hidden layers in multiples of 16, an even number of features. The last
-    layer's products are then not rounded.
+    On CPUs, features and what is between layers never leave the nearest caches: in float32, and under autocast to
+    bfloat16 on those that multiply vectors in it but no tiles (AMX), for hidden layers in multiples of 16 and an even
+    number of features. The last layer's products are then not rounded.
 
     Args:
         positions: (N, 3), in [0, 1].
@@ -42,7 +42,7 @@ def grid_network(
     check_shape("the first weights", weights[0], ("n", in_features))
     if all(x.dtype == torch.float32 for x in (positions, table)) and is_fused(positions, in_features, weights):
         check_grid(positions, table, levels)
-        rounded = [[x.bfloat16() for x in parameters] for parameters in (weights, biases)]
+        rounded = [run_compiled("grid_network", "rounded", positions, x) for x in (weights, biases)]
         return _grid_network(positions, table, levels.cells, levels.max_rows, *rounded)
     return grid_network_reference(positions, table, levels, weights, biases)
 
@@ -61,7 +61,7 @@ def is_fused(positions: Tensor, in_features: int, weights: Sequence[Tensor], *, 
 
     `beside_tiles`: also on processors that multiply whole tiles (AMX), where matrix libraries are as quick at layers.
     """
-    if not is_bfloat16_wanted(positions) or positions.is_cuda or choose(positions) != "numba":
+    if not (is_plain(positions) or is_bfloat16_wanted(positions)) or positions.is_cuda or choose(positions) != "numba":
         return False
     return run_compiled("grid_network", "serves", positions, in_features, weights, beside_tiles)
 

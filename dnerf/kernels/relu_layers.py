@@ -24,7 +24,8 @@ def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tens
     Under autocast to bfloat16, on CPUs that have it, oneDNN adds the bias and cuts off what is negative while it
     multiplies: one pass over memory instead of three. Sums are then rounded in another order, and what was negative is
     -`SLOPE` times its size instead of zero. CPUs that multiply vectors in bfloat16, but no tiles (AMX), do without
-    oneDNN where layers' widths are multiples of 16: a few hundred rows go through all layers in the nearest caches.
+    oneDNN where layers' widths are multiples of 16: a few hundred rows go through all layers in the nearest caches. So
+    do several layers in float32 without gradients.
 
     Args:
         inputs: (..., in_features).
@@ -34,10 +35,14 @@ def relu_layers(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tens
         (..., out_features of the last layer), differentiable to any order.
     """
     # Inputs that are rounded already are served as those that are not.
-    if not (is_bfloat16_wanted(inputs) and choose(inputs.new_empty(0, dtype=torch.float32)) != "reference"):
+    is_rounded, dtype = is_bfloat16_wanted(inputs), torch.float32
+    backend = choose(inputs.new_empty(0, dtype=dtype)) if is_rounded or is_plain(inputs) else "reference"
+    is_served = is_rounded or (backend == "numba" and run_compiled("relu_layers", "serves", inputs, weights))
+    if backend == "reference" or not is_served:
         return relu_layers_reference(inputs, weights, biases)
-    weights, biases = [p.bfloat16() for p in weights], [p.bfloat16() for p in biases]
-    outputs = inputs.reshape(-1, inputs.shape[-1]).bfloat16()
+    dtype = torch.bfloat16 if is_rounded else dtype
+    weights, biases = [p.to(dtype) for p in weights], [p.to(dtype) for p in biases]
+    outputs = inputs.reshape(-1, inputs.shape[-1]).to(dtype)
     if torch.is_grad_enabled():
         outputs = _Layers.apply(outputs, *weights, *biases)
     else:
@@ -58,6 +63,11 @@ def is_bfloat16_wanted(inputs: Tensor) -> bool:
     if device not in ("cpu", "cuda") or inputs.dtype == torch.float64 or not torch.is_autocast_enabled(device):
         return False
     return has_bfloat16(device) and torch.get_autocast_dtype(device) == torch.bfloat16
+
+
+def is_plain(inputs: Tensor) -> bool:
+    """Whether layers keep such inputs in float32, on the CPU."""
+    return inputs.is_cpu and inputs.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
 
 
 @cache

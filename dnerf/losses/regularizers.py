@@ -216,16 +216,13 @@ class TimeEmbeddingLoss(Loss):
         self.to(rendering.rgb.device)
         self.num_rays.add_(len(rendering.rgb))  # a tensor, as above
         for part in self._parts(model):
-            total = total + self._growth(part) * part.roughness()
+            each = self.rays_per_embedding
+            growth = 1.0 if each is None else (self.num_rays / (each * part.num_used)).clamp(min=1)
+            total = total + growth * part.roughness()
         return total
 
     def _parts(self, model: Renderer) -> list[TimeEncoding]:
         return [p for p in model.field.modules() if isinstance(p, TimeEncoding) and p.embeddings is not None]
-
-    def _growth(self, encoding: TimeEncoding) -> Tensor | float:
-        if self.rays_per_embedding is None:
-            return 1.0
-        return (self.num_rays / (self.rays_per_embedding * encoding.num_used)).clamp(min=1)
 
 
 def canonical_surface(field: RadianceField) -> SignedDistance | None:

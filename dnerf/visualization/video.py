@@ -80,7 +80,9 @@ def write_frames(
         raise ValueError(f"quality must be in [0, 10], got {quality}")
     frames = _checked(images)
     if format == "png":
-        _write_folder(frames, path)
+        with replaced_folder(path, lambda name: name.startswith("frame_") and name.endswith(".png")) as folder:
+            for index, frame in enumerate(frames):
+                Image.fromarray(frame).save(folder / f"frame_{index:05d}.png")
         return path
     check_film(path, format)
     with atomic_path(path) as temporary:
@@ -212,9 +214,3 @@ def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> N
     ticks = [math.floor(100 * index / fps + 0.5) for index in range(len(images) + 1)]
     durations = [10 * (after - before) for before, after in itertools.pairwise(ticks)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
-
-
-def _write_folder(frames: Iterator[NDArray[np.uint8]], path: Path) -> None:
-    with replaced_folder(path, lambda name: name.startswith("frame_") and name.endswith(".png")) as folder:
-        for index, frame in enumerate(frames):
-            Image.fromarray(frame).save(folder / f"frame_{index:05d}.png")

@@ -21,13 +21,13 @@ LEVELS = GridLevels([4, (9, 6, 7)], 1 << 12)
 WIDTHS = (8, 16, 16)
 OPTIONS = {"step": 0.05, "subdivision": 3, "min_weight": 1e-3, "subdivision_weight": 1e-2, "stop_transmittance": 1e-3}
 
-pytestmark = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
 
-
-@pytest.fixture(autouse=True, scope="module")
-def fused() -> Iterator[None]:
+@pytest.fixture(autouse=True, scope="module", params=[False, True])
+def fused(request: pytest.FixtureRequest) -> Iterator[None]:
     """Also on CPUs that multiply tiles; and the definition asks the same network, so that only the rest may differ."""
-    with pytest.MonkeyPatch.context() as patch:
+    if request.param and not has_vectors():
+        pytest.skip("this CPU multiplies no vectors in bfloat16")
+    with pytest.MonkeyPatch.context() as patch, torch.autocast("cpu", torch.bfloat16, enabled=request.param):
         patch.setattr("dnerf.kernels.cpu.grid_network.is_supported", lambda: True)
         patch.setattr(sys.modules["dnerf.kernels.trace_network"], "grid_network_reference", grid_network)
         yield
@@ -69,7 +69,7 @@ def rays(count: int, seed: int = 0) -> tuple[Tensor, ...]:
 def both(bundle: tuple[Tensor, ...], tables: FrameTables, **options: float):
     """What the kernel finds, and its definition."""
     scalars = [options[name] for name in ("step", "min_weight", "subdivision_weight", "stop_transmittance")]
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+    with torch.no_grad():
         found = trace_network(*bundle, tables, **options)
         expected = trace_network_reference(list(bundle), tables, int(options["subdivision"]), scalars)
     return found, expected
@@ -77,10 +77,11 @@ def both(bundle: tuple[Tensor, ...], tables: FrameTables, **options: float):
 
 def assert_same(found: tuple[Tensor, Tensor], expected: tuple[Tensor, Tensor], cutoff: float) -> None:
     """The same but for rays of which one interval's weight or light is, but for rounding, the cut-off."""
-    assert torch.equal(found[1], expected[1])
-    errors = (found[0] - expected[0])[found[1]].abs().amax(-1)
+    assert ((found[1] == expected[1]) | (found[0][:, 0] <= 2 * cutoff)).all()
+    both_done = found[1] & expected[1]
+    errors = (found[0] - expected[0])[both_done].abs().amax(-1)
     assert float((errors > 1e-4).float().mean()) <= 0.02 if len(errors) else True
-    torch.testing.assert_close(found[0][found[1]], expected[0][found[1]], rtol=0, atol=1e-4 + 20 * cutoff)
+    torch.testing.assert_close(found[0][both_done], expected[0][both_done], rtol=0, atol=1e-4 + 20 * cutoff)
 
 
 @settings(max_examples=25, deadline=None)
@@ -184,7 +185,5 @@ def test_processors_that_multiply_tiles_are_served_too(monkeypatch: pytest.Monke
     monkeypatch.setattr("dnerf.kernels.cpu.grid_network.is_supported", lambda: False)
     tables = scene()
     network = tables.table, tables.weights[0].shape[1], tables.weights
-    with torch.autocast("cpu", torch.bfloat16):
-        assert is_traced(*network)
-        assert not is_fused(*network)
-    assert not is_traced(*network)  # in float32 nothing is
+    assert is_traced(*network)
+    assert is_fused(*network) != torch.is_autocast_enabled("cpu")

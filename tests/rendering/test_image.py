@@ -17,15 +17,12 @@ from dnerf.deformations import CachedDeformation, DisplacementDeformation, Ident
 from dnerf.deformations.cached import CachedAtTime
 from dnerf.fields import DeformedField, GridField, PlaneFeatures, RadianceField
 from dnerf.fields.base import warn_of_generic_path
-from dnerf.kernels.cpu.dense import has_vectors
 from dnerf.kernels.trace_network import trace_network
 from dnerf.rendering.renderer import Renderer
 from dnerf.samplers import OccupancySampler, Sampler, StratifiedSampler
 
 BOX = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 CAMERA = Camera(Intrinsics(32, 24, 30.0, 30.0), look_at([0.3, -3.2, 0.8], [0.0, 0.0, 0.0]))
-
-vectors = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
 
 
 def model(
@@ -82,15 +79,15 @@ def fused(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     return done
 
 
-@vectors
 @pytest.mark.parametrize("options", [
     {"temporal_terms": 1}, {}, {"view_degree": 2}, {"temporal_terms": 1, "view_degree": 4},
 ])  # fmt: skip
 @pytest.mark.parametrize("subdivision", [1, 3])
+@pytest.mark.parametrize("precision", ["bfloat16", "float32"])
 def test_the_fused_kernel_shows_what_the_generic_path_shows(
-    options: dict, subdivision: int, fused: list[Tensor]
+    options: dict, subdivision: int, precision: str, fused: list[Tensor]
 ) -> None:
-    renderer = model(subdivision=subdivision, **options)
+    renderer = model(subdivision=subdivision, precision=precision, **options)
     expected = generic(renderer)
     assert not fused
     shown = image(renderer)
@@ -106,7 +103,6 @@ def test_the_fused_kernel_shows_what_the_generic_path_shows(
     assert torch.equal(renderer.render_image(CAMERA, 0.3, chunk=100).rgb, shown[..., :3])
 
 
-@vectors
 @pytest.mark.parametrize("subdivision", [1, 3])
 def test_what_nothing_moves_is_rendered_by_the_kernel_too(subdivision: int, fused: list[Tensor]) -> None:
     renderer = model(subdivision=subdivision)
@@ -121,22 +117,19 @@ def test_what_nothing_moves_is_rendered_by_the_kernel_too(subdivision: int, fuse
     assert torch.equal(*shown)
 
 
-@vectors
 def test_rays_that_the_kernel_cannot_follow_are_rendered_all_the_same(fused: list[Tensor]) -> None:
     small = model(box=[[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]], cells=12)
     torch.testing.assert_close(image(small)[..., :4], generic(small)[..., :4], rtol=0, atol=3e-3)
     assert not torch.cat(fused).all()
 
 
-@vectors
 def test_the_kernel_is_used_only_for_what_it_was_made_for(fused: list[Tensor]) -> None:
     planes = PlaneFeatures(BOX, (3,), 2, num_features=2)
-    for renderer in (model(precision="float32"), model(space_time=planes), model(stop=0.0)):
+    for renderer in (model(space_time=planes), model(stop=0.0)):
         image(renderer)
     assert not fused
 
 
-@vectors
 @pytest.mark.parametrize(("options", "part"), [
     ({"space_time": PlaneFeatures(BOX, (3,), 2, num_features=2)}, "space_time features"),
     ({"hidden_features": 12}, r"layers of widths [8, 12, 12, 4]"),
@@ -152,14 +145,12 @@ def test_parts_that_keep_a_model_from_the_kernel_are_named(
     assert not fused
 
 
-@vectors
 def test_another_canonical_field_is_named(fused: list[Tensor], caplog: pytest.LogCaptureFixture) -> None:
     warn_of_generic_path.cache_clear()
     image(model(canonical=Grey))
     assert ["a canonical Grey" in record.message for record in caplog.records] == [True]
 
 
-@vectors
 def test_what_is_filled_ahead_changes_nothing(fused: list[Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
     counts: list[int] = []
     fill = CachedAtTime.fill
@@ -196,7 +187,7 @@ def test_nan_is_shown_not_hidden(subdivision: int, precision: str, fused: list[T
                 parameter.fill_(torch.nan)
         for path in (image, generic):
             assert path(renderer).isnan().any()
-    assert bool(fused) == (precision == "bfloat16" and has_vectors())
+    assert fused
 
 
 class Grey(GridField):
@@ -323,7 +314,7 @@ def test_poses_of_either_precision_are_taken(
 
 
 def test_the_generic_path_fills_a_frame_s_displacements_at_once(fused: list[Tensor]) -> None:
-    renderer = model(precision="float32", subdivision=3)  # which the kernel does not serve
+    renderer = model(hidden_features=12, subdivision=3)  # which the kernel does not serve
     with patch.object(CachedAtTime, "_evaluated", autospec=True, side_effect=CachedAtTime._evaluated) as rounds:
         image(renderer)
     assert not fused

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ..grid_encode import GridLevels
 from .cells import PLACES, cell_tables, fractions_at, locate_all, rows_at, take_places, trilinear_weights
-from .dense import bits_of
 from .launch import BORROWS, FAST, array, kernel, launch, next_task, none_taken, num_threads
 from .rows import add_to_row, blend_rows, dot_slopes
 
@@ -23,8 +22,7 @@ def forward(positions: Tensor, table: Tensor, cells: list[int], max_rows: int, r
     levels, lanes = levels_of(tuple(cells), max_rows), (0,) * table.shape[1]
     size, dtype = (len(positions), len(levels) * len(lanes)), torch.bfloat16 if rounded else table.dtype
     out = table.new_empty(size, dtype=dtype)
-    numbers = bits_of(out) if rounded else out.numpy()
-    launch(_forward, array(positions), array(table), levels, numbers, *_workers(positions), lanes)
+    launch(_forward, array(positions), array(table), levels, array(out), *_workers(positions), lanes)
     return out
 
 

@@ -103,8 +103,9 @@ def next_task(typing: Any, taken: Any) -> tuple[Any, Any]:
 
 
 def array(tensor: Tensor) -> np.ndarray:
-    """The numbers of a tensor, contiguous."""
-    return tensor.detach().contiguous().numpy()
+    """The numbers of a tensor, contiguous; those in bfloat16 as uint16, bit by bit."""
+    tensor = tensor.detach().contiguous()
+    return tensor.view(torch.int16).numpy().view(np.uint16) if tensor.dtype == torch.bfloat16 else tensor.numpy()
 
 
 def offsets_array(offsets: Tensor, num_samples: int) -> np.ndarray:

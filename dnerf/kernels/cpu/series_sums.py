@@ -3,12 +3,9 @@
 
 from typing import Any
 
-import numpy as np
-import torch
 from numba import prange
 from torch import Tensor
 
-from .dense import bits_of
 from .launch import BORROWS, FAST, array, kernel, launch, next_task, none_taken, num_threads
 from .shade import single
 
@@ -17,29 +14,20 @@ ROWS = 256  # dealt out to threads
 
 def forward(coefficients: Tensor, basis: Tensor) -> Tensor:
     out = basis.new_empty(len(basis), 4)
-    launch(_sums, _numbers(coefficients), array(basis), out.numpy(), *_workers())
+    launch(_sums, array(coefficients), array(basis), out.numpy(), num_threads(), none_taken())
     return out
 
 
 def grad_coefficients(grad: Tensor, basis: Tensor, like: Tensor) -> Tensor:
     out = basis.new_empty(like.shape)
-    launch(_spread, array(grad), array(basis), out.numpy(), *_workers())
+    launch(_spread, array(grad), array(basis), out.numpy(), num_threads(), none_taken())
     return out.to(like.dtype)
 
 
 def grad_basis(grad: Tensor, coefficients: Tensor, terms: int) -> Tensor:
     out = grad.new_zeros(len(grad), terms)
-    launch(_gather, array(grad), _numbers(coefficients), out.numpy(), *_workers())
+    launch(_gather, array(grad), array(coefficients), out.numpy(), num_threads(), none_taken())
     return out
-
-
-def _numbers(tensor: Tensor) -> np.ndarray:
-    """Those in bfloat16 as uint16."""
-    return bits_of(tensor) if tensor.dtype == torch.bfloat16 else array(tensor)
-
-
-def _workers() -> tuple[int, np.ndarray]:
-    return num_threads(), none_taken()
 
 
 @kernel(fastmath=FAST, **BORROWS)

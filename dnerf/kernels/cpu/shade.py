@@ -4,14 +4,12 @@
 from typing import Any
 
 import numpy as np
-import torch
 from llvmlite import ir
 from numba import prange, types
 from numba.extending import intrinsic
 from torch import Tensor
 
 from ..shade import MOST_LOG_DENSITY
-from .dense import bits_of
 from .exponential import exp, sigmoid
 from .launch import BORROWS, array, kernel, launch, next_task, none_taken, num_threads
 
@@ -20,11 +18,10 @@ MOST = np.float32(MOST_LOG_DENSITY)
 
 
 def shade(raw: Tensor, bias: Tensor, log_shift: float) -> tuple[Tensor, Tensor]:
-    values = bits_of(raw) if raw.dtype == torch.bfloat16 else array(raw)
     density, rgb = bias.new_empty(len(raw)), bias.new_empty(len(raw), 3)
     shifts = bias.detach() + bias.new_tensor([log_shift, 0, 0, 0])
     lines = np.zeros((num_threads(), 4, ROWS), np.float32)
-    launch(_shade, values, shifts.numpy(), density.numpy(), rgb.numpy(), lines, none_taken())
+    launch(_shade, array(raw), shifts.numpy(), density.numpy(), rgb.numpy(), lines, none_taken())
     return density, rgb
 
 

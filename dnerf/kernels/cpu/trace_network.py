@@ -14,7 +14,7 @@ from ..trace_network import NUM_STATES, FrameTables
 from .cells import PLACES, cell_tables, clamped, fractions_at, locate_in_lattice, rows_at
 from .course import LINE, RAYS_AT_ONCE, TESTED_AT_ONCE, course_of, interval, new_cells, next_kept, ranges_and_bounds
 from .exponential import exp, expm1, sigmoid
-from .grid_network import ROOM, ask_network, network_of, room_of
+from .grid_network import ROOM, ask_network, network_of, room_of, rounded
 from .launch import BORROWS, array, kernel, launch, next_task, none_taken, num_threads
 from .rows import blend_rows, trailing_zeros
 
@@ -34,7 +34,7 @@ def trace_network(
     is_done = torch.ones(len(o), dtype=torch.bool)
     occupancy, aabb, reach = array(tables.occupancy), array(tables.aabb), array(tables.skips)
     ranges, counts, bounds = ranges_and_bounds((o, d, t0, t1, np.zeros_like(t0)), aabb, step, reach[None])
-    weights, biases = ([x.bfloat16() for x in parameters] for parameters in (tables.weights, tables.biases))
+    weights, biases = rounded(rays[0], tables.weights), rounded(rays[0], tables.biases)
     network, widths = network_of(tables.table, tables.levels.cells, tables.levels.max_rows, weights, biases)
     workers, num_words = num_threads(), (int(counts.max(initial=0)) + TESTED_AT_ONCE) // 64 + 1
     displacements, shape = array(tables.displacements), tables.is_known.shape
