@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from kernels.backends import serve_bfloat16
 
 from benchmarks import Settings, run_suite
 from benchmarks.kernel_cases import RESOLUTIONS
@@ -15,7 +16,6 @@ from benchmarks.quadrature import samples_needed
 from benchmarks.smooth import SmoothClouds, exact_smooth
 from dnerf.core.rays import Rays
 from dnerf.kernels import GridLevels, grid_encode, grid_network, is_bfloat16_wanted, packed_weights, relu_layers
-from dnerf.kernels.cpu.dense import has_vectors
 
 RATES = Rates({torch.float32: 1e9}, bandwidth=1e9, cached_bandwidth=1e9)
 
@@ -67,10 +67,8 @@ def test_products_of_fused_layers_are_counted():
     assert counter.work[LAYER].flops == 2 * 32 * (16 * 24 + 24 * 8)
 
 
-@pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
 def test_products_of_whole_networks_are_counted(monkeypatch):
-    for kernel in ("relu_layers", "grid_network"):
-        monkeypatch.setattr(f"dnerf.kernels.cpu.{kernel}.is_supported", lambda: True)
+    serve_bfloat16(monkeypatch)
     levels = GridLevels((4, 8), 1 << 12)
     weights, biases = [torch.rand(32, 16), torch.rand(16, 32), torch.rand(4, 16)], [torch.rand(n) for n in (32, 16, 4)]
     counter = OperationCounter(RATES)

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from kernels.backends import serve_bfloat16
 
 from dnerf import kernels
 
@@ -33,6 +34,5 @@ def backend(request):
 
 @pytest.fixture
 def served(monkeypatch):
-    """Kernels for vectors in bfloat16 serve networks also on CPUs that multiply tiles."""
-    for kernel in ("relu_layers", "grid_network"):
-        monkeypatch.setattr(f"dnerf.kernels.cpu.{kernel}.is_supported", lambda: True)
+    """Kernels for vectors in bfloat16 serve networks on every CPU."""
+    serve_bfloat16(monkeypatch)

@@ -8,11 +8,9 @@ from kernels.backends import under
 from torch import Tensor
 
 from dnerf.kernels import GridLevels, grid_encode, grid_network
-from dnerf.kernels.cpu.dense import has_vectors
 from dnerf.kernels.grid_network import grid_network_reference
 
-# In float32 everywhere, and in bfloat16 where vectors of it are multiplied.
-precisions = pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16][: 1 + has_vectors()])
+precisions = pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 LEVELS = GridLevels([3, (5, 6, 7), 20], 512)  # the last one is hashed
 
 
@@ -47,9 +45,7 @@ def exact(positions: Tensor, rows: Tensor, weights: list[Tensor], biases: list[T
     ("num_features", "widths"),
     [(8, (64, 64, 4)), (2, (16, 1)), (4, (128, 16, 16)), (8, (64, 28)), (2, (16, 49)), (4, (32, 76))],
 )
-def test_it_is_one_part_after_the_other(
-    count: int, num_features: int, widths: tuple[int, ...], dtype: torch.dtype
-) -> None:
+def test_it_is_one_part_after_the_other(count: int, num_features: int, widths: tuple, dtype: torch.dtype) -> None:
     rows, parameters = table(num_features), network((3 * num_features, *widths))
     positions = places(count)
     with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
@@ -75,7 +71,6 @@ def test_without_autocast_nothing_is_rounded(backend: str) -> None:
 
 
 @precisions
-@pytest.mark.usefixtures("served")
 def test_other_sizes_and_dtypes_take_the_chain(dtype: torch.dtype) -> None:
     positions = places(30)
     for num_features, widths in ((1, (16, 4)), (2, (12, 4))):

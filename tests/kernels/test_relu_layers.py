@@ -7,11 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.kernels import has_bfloat16, relu_layers, use_backend
-from dnerf.kernels.cpu.dense import features, has_vectors, is_supported
+from dnerf.kernels.cpu.dense import features, is_supported
 from dnerf.kernels.relu_layers import relu_layers_reference
 
 fused = pytest.mark.skipif(not has_bfloat16("cpu"), reason="this CPU has no products in bfloat16")
-vectors = pytest.mark.skipif(not has_vectors(), reason="this CPU multiplies no vectors in bfloat16")
 
 
 def layers(*widths: int, seed: int = 0) -> nn.ModuleList:
@@ -112,7 +111,6 @@ def test_inputs_that_are_rounded_already_are_served_like_others() -> None:
     assert below == 0 if is_supported() else below > 1000
 
 
-@vectors
 @pytest.mark.usefixtures("served")
 @pytest.mark.parametrize("count", [0, 1, 5, 12, 13, 251, 252, 253, 600])
 @pytest.mark.parametrize("widths", [(2, 16), (6, 48, 16), (40, 64, 64), (32, 128, 128, 128, 128), (64, 32, 96)])
@@ -129,7 +127,6 @@ def test_vectors_round_as_the_definition_does(count: int, widths: tuple[int, ...
     torch.testing.assert_close(found.double(), expected, rtol=2.0**-7, atol=0.02 * len(network))
 
 
-@vectors
 @pytest.mark.usefixtures("served")
 def test_vectors_keep_nan_to_its_row_and_infinity() -> None:
     network, inputs = layers(40, 64, 64), torch.randn(300, 40)
@@ -142,7 +139,6 @@ def test_vectors_keep_nan_to_its_row_and_infinity() -> None:
     assert (~found.isfinite().all(-1)).nonzero()[:, 0].tolist() in ([7], [7, 20])
 
 
-@vectors
 @pytest.mark.usefixtures("served")
 @pytest.mark.parametrize(("shapes", "message"), [(((32, 8), (16, 48)), "n, 32"), (((32, 6), (16, 32)), "n, 8")])
 def test_layers_that_do_not_fit_are_refused(shapes: tuple[tuple[int, int], ...], message: str) -> None:

@@ -8,11 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kernels.backends import under
+from kernels.backends import serve_bfloat16, under
 from torch import Tensor
 
 from dnerf.kernels import FrameTables, GridLevels, grid_network, is_traced, skip_distances, trace_network
-from dnerf.kernels.cpu.dense import has_vectors
 from dnerf.kernels.grid_network import is_fused
 from dnerf.kernels.trace_network import trace_network_reference
 
@@ -24,11 +23,9 @@ OPTIONS = {"step": 0.05, "subdivision": 3, "min_weight": 1e-3, "subdivision_weig
 
 @pytest.fixture(autouse=True, scope="module", params=[False, True])
 def fused(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Also on CPUs that multiply tiles; and the definition asks the same network, so that only the rest may differ."""
-    if request.param and not has_vectors():
-        pytest.skip("this CPU multiplies no vectors in bfloat16")
+    """In both precisions; and the definition asks the same network, so that only the rest may differ."""
     with pytest.MonkeyPatch.context() as patch, torch.autocast("cpu", torch.bfloat16, enabled=request.param):
-        patch.setattr("dnerf.kernels.cpu.grid_network.is_supported", lambda: True)
+        serve_bfloat16(patch)
         patch.setattr(sys.modules["dnerf.kernels.trace_network"], "grid_network_reference", grid_network)
         yield
 

@@ -142,6 +142,12 @@ def dense(
             )  # fmt: skip
 
 
+def instruction(builder: Any, name: str, result: ir.Type, *operands: Any) -> Any:
+    """One of AVX512-BF16."""
+    kind = ir.FunctionType(result, [operand.type for operand in operands])
+    return builder.call(builder.module.declare_intrinsic(f"llvm.x86.avx512bf16.{name}.512", fnty=kind), operands)
+
+
 @intrinsic
 def _dense_rows(
     typing: Any, inputs: Any, first: Any, num_inputs: Any, weights: Any, start: Any, biases: Any, first_bias: Any,
@@ -152,9 +158,7 @@ def _dense_rows(
     operand = PAIRS if in_pair == 2 else SINGLES
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        inputs_, first_, count_, weights_, start_, biases_, first_bias_, out_, first_out_, width_, _, _, floor = (
-            arguments
-        )
+        inputs_, first_, count_, weights_, start_, biases_, first_bias_, out_, first_out_, width_, *_, low = arguments
         long = ir.IntType(64)
 
         def after(start: Any, number: Any, factor: Any) -> Any:
@@ -171,14 +175,9 @@ def _dense_rows(
             for line in sums:
                 builder.store(builder.load(bias, align=4), line[n])
 
-        def instruction(name: str, result: ir.Type, *operands: Any) -> Any:
-            kind = ir.FunctionType(result, [operand.type for operand in operands])
-            function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.x86.avx512bf16.{name}.512")
-            return builder.call(function, operands)
-
         def add(total: Any, value: Any, weight: Any) -> Any:
             if in_pair == 2:
-                return instruction("dpbf16ps", SINGLES, total, value, weight)
+                return instruction(builder, "dpbf16ps", SINGLES, total, value, weight)
             return builder.fadd(total, builder.fmul(value, weight, flags=FLAGS), flags=FLAGS)
 
         with cgutils.for_range(builder, builder.udiv(count_, long(in_pair))) as loop:
@@ -191,13 +190,13 @@ def _dense_rows(
                 values = builder.bitcast(splat(builder, pair, LANES), operand)
                 for total, weight in zip(line, passing, strict=True):
                     builder.store(add(builder.load(total), values, weight), total)
-        lowest = splat(builder, floor, LANES)
+        lowest = splat(builder, low, LANES)
         for row, line in enumerate(sums):
             for n, total in enumerate(line):
                 value = builder.load(total)
                 value = builder.select(builder.fcmp_ordered("<", value, lowest), lowest, value)  # NaN is not, and stays
                 if out.dtype == types.uint16:
-                    value = instruction("cvtneps2bf16", HALVES, value)
+                    value = instruction(builder, "cvtneps2bf16", HALVES, value)
                 pointer = data(out, out_, after(after(first_out_, row, width_), n, LANES), value.type)
                 builder.store(value, pointer, align=out.dtype.bitwidth // 8)
         return context.get_dummy_value()
