@@ -76,7 +76,9 @@ def has_bfloat16(device: str) -> bool:
     if device == "cuda":
         found = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
-        has_onednn = torch.backends.mkldnn.is_available()
+        # With AVX-512 alone oneDNN emulates them, which takes twice as long as float32 (its issue 493).
+        is_emulated = torch.cpu._is_avx512_supported() and not torch.cpu._is_avx512_bf16_supported()
+        has_onednn = torch.backends.mkldnn.is_available() and not is_emulated
         found = device != "cpu" or bool(has_onednn and torch.ops.mkldnn._is_mkldnn_bf16_supported())
     if not found:
         logger.info("this processor has no instructions for bfloat16: all is computed in float32, which is slower")

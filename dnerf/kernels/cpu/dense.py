@@ -67,10 +67,8 @@ def is_supported() -> bool:
 
 
 def at_once(widths: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Tuples as long as rows, and vectors of outputs, at once are many in layers of such widths, multiples of `LANES`.
-
-    Their lengths are constants to the compiler.
-    """
+    """Tuples, constants to the compiler, as long as rows, and vectors of outputs, at once are many in layers of such
+    widths in multiples of `LANES`."""
     table = ROWS_OF if features().get("avx512f") else ROWS_OF_SHORT
     vectors = next(count for count in table if all(width % (count * LANES) == 0 for width in widths))
     return (0,) * table[vectors], (0,) * vectors
