@@ -101,6 +101,7 @@ def make_trainer(
     if callbacks is None:
         callbacks = {"recovery": Recovery(), "progress_bar": ProgressBar(), "weight_average": WeightAverage()}
     return Trainer(
-        num_steps=num_steps, max_seconds=max_seconds, opening_steps=1500, num_rays=256, target_samples=15360,
-        losses=losses, pixels=ErrorGuidedPixels(TemporalCurriculum(0.3)), optimizer=optimizer, callbacks=callbacks,
+        num_steps=num_steps, max_seconds=max_seconds, opening_steps=1500, num_rays=256, max_rays=16384,
+        target_samples=15360, losses=losses, pixels=ErrorGuidedPixels(TemporalCurriculum(0.3)), optimizer=optimizer,
+        callbacks=callbacks,
     )  # fmt: skip
