@@ -8,7 +8,7 @@ from kernels.backends import under
 from torch import Tensor
 
 from dnerf.kernels import GridLevels, grid_encode, grid_network
-from dnerf.kernels.grid_network import grid_network_reference
+from dnerf.kernels.grid_network import grid_network_reference, is_fused
 
 precisions = pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 LEVELS = GridLevels([3, (5, 6, 7), 20], 512)  # the last one is hashed
@@ -71,16 +71,14 @@ def test_without_autocast_nothing_is_rounded(backend: str) -> None:
 
 
 @precisions
+@pytest.mark.usefixtures("served")
 def test_other_sizes_and_dtypes_take_the_chain(dtype: torch.dtype) -> None:
-    positions = places(30)
-    for num_features, widths in ((1, (16, 4)), (2, (12, 4))):
-        rows, parameters = table(num_features), network((3 * num_features, *widths))
+    for widths, is_served in (((3, 16, 4), False), ((6, 12, 4), False), ((6, 16, 4), True)):
         with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-            found, chain = (f(positions, rows, LEVELS, *parameters) for f in (grid_network, grid_network_reference))
-        assert torch.equal(found, chain)
+            assert is_fused(places(3), widths[0], network(widths)[0]) == is_served
     rows, (weights, biases) = table(2).double(), network((6, 16, 4))
     double = [[p.double() for p in parameters] for parameters in (weights, biases)]
-    assert grid_network(positions.double(), rows, LEVELS, *double).dtype == torch.float64
+    assert grid_network(places(30).double(), rows, LEVELS, *double).dtype == torch.float64
 
 
 @precisions

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from dnerf.kernels import has_bfloat16, relu_layers, use_backend
-from dnerf.kernels.cpu.dense import features, is_supported
+from dnerf.kernels.cpu.dense import cpu_features, is_supported
 from dnerf.kernels.relu_layers import relu_layers_reference
 
 fused = pytest.mark.skipif(not has_bfloat16("cpu"), reason="this CPU has no products in bfloat16")
@@ -146,7 +146,7 @@ def test_layers_that_do_not_fit_are_refused(shapes: tuple[tuple[int, int], ...],
 
 def test_code_for_another_processor_does_without_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("numba.config.CPU_NAME", "generic")
-    assert not features.__wrapped__()
+    assert not cpu_features.__wrapped__()
 
 
 def test_a_processor_without_bfloat16_is_told_of_once(monkeypatch, caplog: pytest.LogCaptureFixture) -> None:

@@ -50,7 +50,7 @@ HALVES, PAIRS = ir.VectorType(_BFloat(), LANES), ir.VectorType(_BFloat(), 2 * LA
 
 
 @cache
-def features() -> dict[str, bool]:
+def cpu_features() -> dict[str, bool]:
     """Of the processor; none if somebody wants code for another."""
     is_other = numba.config.CPU_NAME or numba.config.CPU_FEATURES
     return {} if is_other else dict(llvmlite.binding.get_host_cpu_features())
@@ -58,18 +58,17 @@ def features() -> dict[str, bool]:
 
 def has_vectors() -> bool:
     """Whether the processor multiplies vectors in bfloat16."""
-    return features().get("avx512bf16", False) and llvmlite.binding.llvm_version_info >= TESTED_LLVM
+    return cpu_features().get("avx512bf16", False) and llvmlite.binding.llvm_version_info >= TESTED_LLVM
 
 
 def is_supported() -> bool:
     """Whether it does, and does not multiply whole tiles, which matrix libraries make use of."""
-    return has_vectors() and not features().get("amx-bf16")
+    return has_vectors() and not cpu_features().get("amx-bf16")
 
 
 def at_once(widths: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Tuples, constants to the compiler, as long as rows, and vectors of outputs, at once are many in layers of such
-    widths in multiples of `LANES`."""
-    table = ROWS_OF if features().get("avx512f") else ROWS_OF_SHORT
+    """Tuples as long as rows, and as vectors of outputs, are many at once; of widths in multiples of `LANES`."""
+    table = ROWS_OF if cpu_features().get("avx512f") else ROWS_OF_SHORT
     vectors = next(count for count in table if all(width % (count * LANES) == 0 for width in widths))
     return (0,) * table[vectors], (0,) * vectors
 

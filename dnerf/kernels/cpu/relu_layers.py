@@ -18,7 +18,8 @@ ROWS, ZERO = 252, np.float32(0)  # rows dealt out to threads
 def serves(inputs: Tensor, weights: Sequence[Tensor]) -> bool:
     """Whether layers of such sizes are served on this processor."""
     if inputs.dtype == torch.float32:
-        return not torch.is_grad_enabled() and len(weights) > 1 and all(len(weight) % LANES == 0 for weight in weights)
+        fits = all(len(weight) % LANES == 0 and weight.dtype == torch.float32 for weight in weights)
+        return fits and len(weights) > 1 and not torch.is_grad_enabled()  # with gradients MKL is as quick
     return is_supported() and inputs.shape[-1] % 2 == 0 and all(len(weight) % LANES == 0 for weight in weights)
 
 
