@@ -61,20 +61,19 @@ def results_page(folder: Path) -> str:
 
 
 def plot_of_all(folder: Path) -> Plot | None:
-    """PSNR against seconds of training on CPUs, of all experiments of which reports at 400 x 400 have several budgets.
+    """PSNR against seconds of training at 400 x 400, all on one CPU: that of the latest report.
 
-    A CPU without bfloat16 takes three times as long a step, so its reports are left out.
-
-    Of two reports of the same, the later one counts. None if there is nothing to show; ValueError as `results_page`.
+    Of two reports of the same, the later one counts. None if nothing has several budgets; ValueError as `results_page`.
     """
-    rows = {}
+    rows: dict[str, dict[tuple[Any, ...], dict[str, Any]]] = {}
     for report in sorted(_reports(folder).values(), key=lambda report: report["date"]):
-        for row in report["tables"].get(QUALITY, []):
-            is_other = any(name in report["machine"]["hardware"] for name in ("NVIDIA", "without bfloat16"))
-            if row.get("resolution") == 400 and not is_other:
-                rows[row["scene"], row["experiment"], row["budget_s"]] = row
-    counts = Counter(key[:2] for key in rows)
-    shown = [rows[key] for key in sorted(rows) if counts[key[:2]] > 1]
+        hardware, table = report["machine"]["hardware"], report["tables"].get(QUALITY, [])
+        own = {(row["scene"], row["experiment"], row["budget_s"]): row for row in table if row.get("resolution") == 400}
+        if own and "NVIDIA" not in hardware:
+            rows[hardware] = {**rows.pop(hardware, {}), **own}  # the last one of all
+    latest = next(reversed(rows.values()), {})
+    counts = Counter(key[:2] for key in latest)
+    shown = [latest[key] for key in sorted(latest) if counts[key[:2]] > 1]
     return quality_plot(shown) if shown else None
 
 
@@ -152,7 +151,7 @@ def _kernels(rows: list[Row]) -> Iterator[Row]:
 
 QUALITY_NOTE = """Held-out frames; with several seeds their mean and, in brackets, worst and best. `model MiB` is the
 size of the weights file. D-NeRF's Lego is scored on `val`: its test split shows another pose than its train split.
-The plot has the latest report of each row at 400 x 400 on CPUs with bfloat16. Commits differ, see below."""
+The plot has the latest report of each row at 400 x 400, of the CPU that was used last. Commits differ, see below."""
 FRAMES_NOTE = "Each frame alone, in evaluation mode: median and quartiles of the time."
 KERNELS_NOTE = "The compiled version, and how many times as long its definition and the best plain torch take."
 SECTIONS: tuple[tuple[str, str, str, Callable[[list[Row]], Iterator[Row]]], ...] = (

@@ -24,9 +24,9 @@ KERNEL = {
 }  # fmt: skip
 
 
-def write(folder, name, table, rows, date="2026-11-28 10:00 UTC"):
+def write(folder, name, table, rows, date="2026-11-28 10:00 UTC", hardware="2 x CPU"):
     result = SuiteResult(f"The {name}", "", [Table("Rows", rows, name=table)])
-    machine = {"hardware": "2 x CPU", "commit": "abc"}
+    machine = {"hardware": hardware, "commit": "abc"}
     write_report(result, folder / name, command=f"make {name}", machine=machine, date=f"{date}, in 9 s")
 
 
@@ -60,6 +60,8 @@ def test_one_plot_has_what_has_several_budgets_and_stands_above_the_table(report
     assert plot_of_all(reports) is None
     later = [{**QUALITY, **x} for x in ({"psnr": 35.0}, {"budget_s": 300, "psnr": 37.0}, {"resolution": 96})]
     write(reports, "a_later_one", "means_over_seeds", later, date="2026-11-29 10:00 UTC")
+    write(reports, "gpu", "means_over_seeds", later, date="2026-11-30 10:00 UTC", hardware="CPU, NVIDIA")
+    write(reports, "before", "means_over_seeds", [{**QUALITY, "budget_s": 9}], hardware="1 x CPU")
     (series,) = plot_of_all(reports).series
     assert (series.label, series.x, series.y) == ("mutant, fast", [60, 300], [35.0, 37.0])
     assert "quality.png" not in results_page(reports)
