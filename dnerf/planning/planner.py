@@ -14,7 +14,7 @@ from dnerf.planning.trials import Contender, Effort, HeldOut, Maker, contest, sp
 from dnerf.training.callbacks import Callback
 from dnerf.training.run import Run
 
-LEAST_STEPS = 16  # of a trial: fewer tell nothing
+LEAST_STEPS = 48  # of a trial: fewer cost a short training more than they tell
 LEAST_DONE = 64  # steps of a model before its parts are tried: what helps a fresh one may not help for long
 MOST_STEPS = 400  # more tell nothing new
 
@@ -115,6 +115,9 @@ class _Planner:
         part, standing = self.parts[name], self.standing[name].choice
         leading = self._leading(learnt, self._choices(), part.at)
         effort = self._effort(leading, len(part.candidates) - 1, num_left)
+        if effort.num_steps >= LEAST_STEPS:  # otherwise no frame is held out in vain
+            self._advance(leading, part.at)
+            effort = self._effort(leading, len(part.candidates) - 1, num_left)
         if effort.num_steps < LEAST_STEPS or leading.run.step < LEAST_DONE:
             self.decisions[name] = self._untried(name, "the budget is too small to try")
             return
@@ -130,8 +133,7 @@ class _Planner:
         self.lost_steps += sum(loser.run.step - first for loser, _ in losers)
         second = "the others" if len(losers) > 1 else losers[0][0].choice
         why = f"{effort.num_steps} steps, on held-out pixels, against {second}"
-        is_finite = math.isfinite(result.gain + result.error)
-        finite = {"gain": result.gain, "error": result.error} if is_finite else {}
+        finite = {"gain": result.gain, "error": result.error} if math.isfinite(result.gain + result.error) else {}
         self.decisions[name] = Decision(winner.choice, "trial", why, seconds=lost, **finite)
         winner.run.seconds += lost
         winner.run.callbacks = leading.run.callbacks
@@ -145,7 +147,7 @@ class _Planner:
         return Decision(part.first if is_first else part.default, "default", why)
 
     def _leading(self, learnt: Frames, choices: Mapping[str, str], at: float) -> Contender:
-        """The model decided so far, trained until a progress; its first steps are those of parts' first candidates."""
+        """The model decided so far, after first steps of parts' first candidates, at most until a progress."""
         undecided = {n: p for n, p in self.parts.items() if n not in self.decisions and choices[n] == p.default}
         first = {**choices, **{name: part.first for name, part in undecided.items()}}
         if self.leading is None:
@@ -156,10 +158,8 @@ class _Planner:
         if self.leading.run.step < LEAST_DONE:
             self._advance(self.leading, at, LEAST_DONE)
             if first != choices and self.leading.run.step >= LEAST_DONE:
-                callbacks = self.leading.run.callbacks
                 self.leading = self.leading.forked("", self.make, choices, learnt, self.seed)
-                self.leading.run.callbacks = callbacks
-        self._advance(self.leading, at)
+                self.leading.run.callbacks = self.callbacks
         return self.leading
 
     def _advance(self, leading: Contender, at: float, step: float = math.inf) -> None:

@@ -28,8 +28,7 @@ AVERAGE = "average"  # callback
 
 @dataclass(frozen=True)
 class Effort:
-    """What each candidate may spend: seconds where training is limited by them, so that a part must earn what it costs,
-    else steps."""
+    """What each candidate may spend: seconds if these end training (a part must earn what it costs), else steps."""
 
     num_steps: int
     seconds: float  # that so many steps of the model that stands take
