@@ -115,7 +115,7 @@ class _Planner:
         part, standing = self.parts[name], self.standing[name].choice
         leading = self._leading(learnt, self._choices(), part.at)
         effort = self._effort(leading, len(part.candidates) - 1, num_left)
-        if effort.num_steps >= LEAST_STEPS:  # otherwise no frame is held out in vain
+        if effort.num_steps >= LEAST_STEPS:  # else stop at once: frames would be held out in vain
             self._advance(leading, part.at)
             effort = self._effort(leading, len(part.candidates) - 1, num_left)
         if effort.num_steps < LEAST_STEPS or leading.run.step < LEAST_DONE:
