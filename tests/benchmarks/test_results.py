@@ -60,7 +60,7 @@ def test_one_plot_has_what_has_several_budgets_and_stands_above_the_table(report
     assert plot_of_all(reports) is None
     later = [{**QUALITY, **x} for x in ({"psnr": 35.0}, {"budget_s": 300, "psnr": 37.0}, {"resolution": 96})]
     write(reports, "a_later_one", "means_over_seeds", later, date="2026-11-29 10:00 UTC")
-    write(reports, "gpu", "means_over_seeds", [{**x, "psnr": 5.0} for x in later], "2026-11-30 10:00 UTC", "CPU, NVIDIA")
+    write(reports, "gpu", "means_over_seeds", [{**x, "psnr": 5.0} for x in later], "2026-11-30 10:00 UTC", "NVIDIA")
     write(reports, "before", "means_over_seeds", [{**QUALITY, "budget_s": 9}], hardware="1 x CPU")
     (series,) = plot_of_all(reports).series
     assert (series.label, series.x, series.y) == ("mutant, fast", [60, 300], [35.0, 37.0])
